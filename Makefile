@@ -1,0 +1,29 @@
+# Everything below works on a fresh machine with Python 3.11 or newer: the first target makes .venv and installs into it.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+SCENE ?= experiments/scenes/cornell_fog.toml
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.PHONY: install render test test-slow lint clean
+
+install: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
+	touch $@
+
+render: $(INSTALLED)  ## a fog-filled Cornell box (or SCENE=file.toml) into out/
+	$(BIN)/jaxvol render $(SCENE) --out out
+
+test: $(INSTALLED)  ## the suite without its slow statistical part
+	$(BIN)/python -m pytest -q
+
+test-slow: $(INSTALLED)  ## the slow statistical part alone
+	$(BIN)/python -m pytest -q -m slow
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+
+clean:
+	rm -rf .venv out
