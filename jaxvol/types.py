@@ -61,9 +61,13 @@ class PhaseTable(eqx.Module):
 
 
 class Majorants(eqx.Module):
-    """Maximum density of each coarse cell, of the trilinear interpolant and so a true bound."""
+    """Maximum density of each coarse cell, of the trilinear interpolant and so a true bound.
+
+    A cell covers `block` voxels along each axis, counted from the lower bounds; the last one may stick out.
+    """
 
     density: Float[Array, "Xc Yc Zc"]
+    block: int = eqx.field(static=True)
 
 
 class Medium(eqx.Module):
@@ -110,6 +114,7 @@ class AreaLights(eqx.Module):
     face: Int[Array, "P"]
     probability: Float[Array, "P"]  # of choosing this face
     cdf: Float[Array, "P"]  # inclusive cumulative sum, ends at 1
+    total: Float[Array, ""]  # sum of area times luminance
 
 
 class EnvironmentLight(eqx.Module):
