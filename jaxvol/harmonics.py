@@ -52,15 +52,18 @@ def legendre(x: Float[Array, "*batch"], num: int) -> Float[Array, "*batch num"]:
     return jnp.stack(values[:num], axis=-1)
 
 
-def _normalised_legendre(z, order: int) -> dict:
-    """Q_l^m with y_l^m = Q_l^m sin^m(theta) cos or sin(m phi): the polynomial parts, by a recursion that cannot overflow."""
+def normalised_legendre(z, order: int) -> dict:
+    """Q_l^m(z) by pair (l, m), with y_l^m = Q_l^m sin^m(theta) {cos, sin}(m phi); z is a numpy or jax array.
+
+    The recursion on normalised functions cannot overflow.
+    """
     table = {}
     diagonal = sqrt(1 / (4 * pi))
     for m in range(order):
         if m > 0:
             diagonal *= sqrt((2 * m + 1) / (2 * m))
         scale = diagonal if m == 0 else sqrt(2) * diagonal
-        table[m, m] = scale * jnp.ones_like(z)
+        table[m, m] = scale + 0 * z
         if m + 1 < order:
             table[m + 1, m] = sqrt(2 * m + 3) * z * table[m, m]
         for band in range(m + 2, order):
@@ -73,7 +76,7 @@ def _normalised_legendre(z, order: int) -> dict:
 def evaluate_sh(direction: Float[Array, "*batch 3"], order: int) -> Float[Array, "*batch N2"]:
     """All y_l^m at unit directions, index l(l+1)+m."""
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
-    table = _normalised_legendre(z, order)
+    table = normalised_legendre(z, order)
     cosine, sine = jnp.ones_like(x), jnp.zeros_like(x)  # sin^m(theta) cos(m phi) and sin(m phi), as polynomials of x, y
     values = [None] * num_sh(order)
     for m in range(order):
@@ -89,7 +92,7 @@ def evaluate_half(
     cos_theta: Float[Array, "*batch"], sin_theta: Float[Array, "*batch"], order: int
 ) -> Float[Array, "*batch half"]:
     """y_l^m, m >= 0, on the meridian phi = 0, half index. sin_theta may be negative (phi = pi)."""
-    table = _normalised_legendre(cos_theta, order)
+    table = normalised_legendre(cos_theta, order)
     powers = [jnp.ones_like(sin_theta)]
     for _ in range(1, order):
         powers.append(powers[-1] * sin_theta)
