@@ -228,11 +228,11 @@ def _sigma(key: str, value: Sequence[float], scale: float):
 
 def _density(key: str, table: InclusionTable, base: Path) -> tuple[np.ndarray | None, Any, float]:
     """Grid and bounds of a density, or None, None and its one value when it is homogeneous."""
-    from jaxvol import volumes
-
     value, name = table.density, f"{key}.density"
     if isinstance(value, float):
         return None, None, value
+    from jaxvol import volumes
+
     if isinstance(value, str):
         try:
             if value.startswith("builtin:"):

@@ -1,0 +1,5 @@
+"""`python -m jaxvol` is `jaxvol`."""
+
+from jaxvol.cli import main
+
+main()

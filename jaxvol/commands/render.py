@@ -1,0 +1,130 @@
+"""`jaxvol render`: a scene file to an EXR with all layers, a PNG and a JSON report."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import jaxvol
+from jaxvol import image, jobs, rendering
+from jaxvol.layers import items, total
+from jaxvol.scene import SceneFile, load_scene
+
+
+def render(
+    scene: Annotated[Path, typer.Argument(help="Scene file (TOML).", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for the picture; made where missing.")] = Path("out"),
+    method: Annotated[str | None, typer.Option(help="Method; default: the file's, or path_tracing.")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as in medium.anisotropy=0.3.")
+    ] = None,
+    samples: Annotated[int | None, typer.Option(help="Samples per pixel, for methods that sample.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the random numbers.")] = None,
+    explain: Annotated[bool, typer.Option("--explain", help="Print what the scene lacks and so what is skipped.")] = False,
+) -> None:
+    """Render SCENE and write DIR/<scene>.exr (all layers), .png (tone mapped) and .json (times, claims, settings)."""
+    overrides = list(set_ or [])
+    for key, value in (("method", method), ("samples", samples), ("seed", seed)):
+        if value is not None:
+            overrides.append(f"render.{key}={value}")
+    file = load_scene(scene, overrides=overrides)
+    _prepare(out)
+    for note in file.notes:
+        _say(f"note: {note}")
+    if explain:
+        for line in rendering.lacks(file.scene):
+            print(line)
+
+    name = file.render.method
+    with jobs.progress(f"{file.name}, {name}", total=1.0) as advance:
+        done = 0.0
+
+        def progress(part: float, whole: float) -> None:
+            nonlocal done
+            share = min(part / whole, 1.0)
+            advance(share - done)
+            done = share
+
+        result = rendering.render_scene(file, progress=progress)
+        advance(1.0 - done)
+    if explain:
+        _explain(result)
+    _write(file, result, out)
+    if result.nonfinite_pixels:
+        _say(f"error: {result.nonfinite_pixels} pixels are not finite (magenta in the PNG)")
+        raise typer.Exit(1)
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)
+
+
+def _prepare(out: Path) -> None:
+    """Fail before the work, not after it, where nothing can be written."""
+    out.mkdir(parents=True, exist_ok=True)
+    probe = out / ".jaxvol-write-test"
+    jobs.write_bytes(probe, b"")
+    probe.unlink()
+
+
+def _explain(result: rendering.Rendering) -> None:
+    for line in result.skipped:
+        print(f"{result.method} skips: {line}")
+    for claim in result.claims:
+        print(f"{result.method} computes {claim.name}" + (f", partly: {claim.partial}" if claim.partial else ""))
+    missing = rendering.unclaimed(result.claims)
+    if missing:
+        print(f"{result.method} does not compute {', '.join(missing)}")
+
+
+def _write(file: SceneFile, result: rendering.Rendering, out: Path) -> None:
+    rgb = np.asarray(total(result.estimate.mean))
+    exposure = None if file.render.exposure == "auto" else file.render.exposure
+    about = {
+        "scene": file.name,
+        "method": result.method,
+        "arguments": result.arguments,
+        "seed": file.render.seed,
+        "config": file.config,
+        "versions": rendering.versions(),
+    }
+    stem = out / file.name
+    exr, png, report = (stem.with_name(stem.name + suffix) for suffix in (".exr", ".png", ".json"))
+    image.write_exr(exr, image.estimate_channels(result.estimate), metadata=about)
+    exposure = image.write_png(png, rgb, exposure=exposure)
+    first_picture = time.perf_counter() - jaxvol.STARTED
+    jobs.write_json(
+        report,
+        about
+        | {
+            "seconds": result.seconds,
+            "stages": result.stages,
+            "claims": [{"layers": claim.name, "partial": claim.partial} for claim in result.claims],
+            "skipped": list(result.skipped),
+            "nonfinite_pixels": result.nonfinite_pixels,
+            "device": rendering.device(),
+            "exposure": exposure,
+            "seconds_to_first_picture": first_picture,
+            "samples": None if result.estimate.num_samples is None else float(result.estimate.num_samples),
+            "diagnostics": {name: _finite(value) for name, value in result.estimate.diagnostics.items()},
+            "notes": list(file.notes),
+        },
+    )
+    layers = [name for name, _ in items(result.estimate.mean)]
+    print(f"{png}  (exposure {exposure:+.2f} stops)")
+    print(f"{exr}  ({len(layers)} layers: {', '.join(layers)})")
+    print(f"{report}")
+    times = ", ".join(f"{name} {value:.1f} s" for name, value in result.seconds.items())
+    print(f"{times}; first picture {first_picture:.1f} s after the start")
+
+
+def _finite(value: object) -> object:
+    """JSON has no NaN and no infinities: they become text."""
+    array = np.asarray(value)
+    if array.size > 64:
+        return f"array {list(array.shape)}"
+    plain = array.tolist()
+    return plain if array.dtype.kind in "biu" or np.isfinite(array).all() else str(plain)
