@@ -1,0 +1,204 @@
+"""Splatting: shells of doubling radius around every surfel, each into one sub-buffer of its level (paper sections 3.2, 4.2).
+
+A pair of surfel and sample at distance d belongs to the level whose shell [R_l-1, R_l) holds d, R_l = 2^l R_0; there the
+surfel meets the pixel with probability 4^-l and counts 4^l fold: unbiased. With R_0 = r sqrt(pi L/epsilon) that
+probability is proportional to what the pair exchanges. The last shell reaches infinity, so that no light is lost.
+
+Work comes as pairs of (tile of rays, group of surfels): all of them (`dense`) or those that `tile_lists` kept.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxvol.methods.deep_screen_space import kernel
+from jaxvol.methods.deep_screen_space.lighting import LitSurfels
+from jaxvol.types import PhaseTable
+
+RADII = ("quadratic", "paper")
+
+
+class LevelRays(eqx.Module):
+    """The active rays of one level, tile by tile; padding rays have weight 0 and a harmless direction."""
+
+    direction: Float[Array, "tiles 3 T"]
+    distance: Float[Array, "tiles n T"]
+    weight: Float[Array, "tiles n 3 T"] | None  # per sample and channel; None when constant along a ray
+    cell: Int[Array, "tiles n T"] | None  # of the transport table, per sample
+    sub_buffer: Int[Array, "tiles"]
+
+
+class LevelSurfels(eqx.Module):
+    """The surfels of one level: rows of kernel.COLUMNS in groups of M, sub-buffer by sub-buffer."""
+
+    row: Float[Array, "groups M columns"]
+    cluster: Int[Array, "groups"]  # of the transport table; a group never straddles clusters
+
+
+def first_radius(
+    area: Float[Array, "S"], radiance: Float[Array, "S 3"], epsilon, *, radius: str = "quadratic"
+) -> Float[Array, "S"]:
+    """R_0: `quadratic` r sqrt(pi max(L)/epsilon); `paper` r max(L)/epsilon, its getMaxDist. 0 for unlit surfels.
+
+    The paper reasons with a quadratic fall-off but prints the linear formula. epsilon has the unit of radiance.
+    """
+    r = jnp.sqrt(area * (1.0 / jnp.pi))
+    brightest = jnp.max(radiance, axis=-1)
+    if radius == "paper":
+        return r * brightest / epsilon
+    return r * jnp.sqrt(jnp.pi * brightest / epsilon)
+
+
+def shell(first: Float[Array, "S"], *, level: int, num_levels: int, tail: bool) -> tuple[Float[Array, "S"], Float[Array, "S"]]:
+    """Squared inner and outer radius of the shell of `level`; with `tail` the last one is unbounded. Empty if first is 0."""
+    lit = first > 0
+    outer = first * 2.0**level
+    inner = jnp.zeros_like(first) if level == 0 else 0.5 * outer
+    outer = jnp.where(lit, jnp.inf, 0.0) if tail and level == num_levels - 1 else outer
+    return inner * inner, outer * outer
+
+
+@partial(jax.jit, static_argnames=("level", "num_levels", "tail", "group_size", "cluster_size"))
+def level_surfels(
+    lit: LitSurfels,
+    first: Float[Array, "S"],
+    origin: Float[Array, "3"],
+    order: Int[Array, "sub members"],
+    *,
+    level: int,
+    num_levels: int,
+    tail: bool,
+    group_size: int,
+    cluster_size: int,
+) -> LevelSurfels:
+    """Rows of one level: positions relative to the rays' common origin, radiance times area times 4^level.
+
+    delta stays that of the original surfel: scaled with the area it would bias pairs nearer than it.
+    """
+    inner, outer = shell(first, level=level, num_levels=num_levels, tail=tail)
+    emitted = lit.radiance * (lit.area * 4.0**level)[:, None]
+    delta = lit.area * (0.5 / jnp.pi)
+    columns = [*(lit.position - origin).T, *lit.normal.T, inner, outer, jnp.maximum(delta, 1e-20), *emitted.T]
+    if lit.lobe_direction is not None:
+        columns += [*lit.lobe_direction.T, lit.lobe_exponent]
+    row = jnp.stack(columns, axis=-1)[order.reshape(-1)]
+    groups = order.reshape(-1, group_size)
+    return LevelSurfels(row=row.reshape(-1, group_size, row.shape[-1]), cluster=groups[:, 0] // cluster_size)
+
+
+@partial(jax.jit, static_argnames=("stride",))
+def level_rays(
+    direction: Float[Array, "A 3"],
+    distance: Float[Array, "N A"],
+    weight: Float[Array, "M 3 A"],
+    cell: Int[Array, "N A"] | None,
+    ray: Int[Array, "tiles T"],
+    sub_buffer: Int[Array, "tiles"],
+    phase: Int[Array, "A"],
+    *,
+    stride: int = 1,
+) -> LevelRays:
+    """The rays of one level in the order of its tiles, with every `stride`-th sample from `phase` on.
+
+    Weights that are constant along a ray (M = 1) are left out: they are applied once, after the levels are summed.
+    """
+    num = distance.shape[0] // stride
+
+    def thin(values):  # [N, A] -> [num, A]
+        if stride == 1:
+            return values
+        values = values.reshape(num, stride, -1)
+        picked = values[:, 0]
+        for s in range(1, stride):
+            picked = jnp.where(phase == s, values[:, s], picked)
+        return picked
+
+    def arrange(values):  # [n, A] -> [tiles, n, T]
+        padded = jnp.concatenate([values, jnp.zeros((values.shape[0], 1), values.dtype)], axis=1)
+        return jnp.swapaxes(padded.T[ray], 1, 2)
+
+    weights = None
+    if weight.shape[0] > 1:
+        thinned = jnp.stack([thin(weight[:, c]) for c in range(3)], axis=1)  # [num, 3, A]
+        weights = arrange(thinned.reshape(num * 3, -1)).reshape(ray.shape[0], num, 3, ray.shape[1])
+    return LevelRays(
+        direction=arrange(direction.T),
+        distance=arrange(thin(distance)),
+        weight=weights,
+        cell=None if cell is None else arrange(thin(cell)),
+        sub_buffer=sub_buffer,
+    )
+
+
+@partial(jax.jit, static_argnames=("phase", "batch", "glossy"))
+def splat(
+    rays: LevelRays,
+    surfels: LevelSurfels,
+    tile: Int[Array, "capacity"],
+    group: Int[Array, "capacity"],
+    num_pairs: Int[Array, ""],
+    transport: Float[Array, "clusters cells"] | None,
+    g: Float[Array, ""],
+    table: PhaseTable | None,
+    *,
+    phase: str,
+    batch: int,
+    glossy: bool = False,
+) -> Float[Array, "tiles 3 T"]:
+    """Sum over the listed (tile, group) pairs of what the group's surfels send through the tile's samples, per ray.
+
+    `capacity` is a multiple of `batch`; entries from `num_pairs` on are skipped, whole batches at no cost. `transport`
+    is looked up at the samples' cells, once for all surfels of a group.
+    """
+    names = kernel.GLOSSY_COLUMNS if glossy else kernel.COLUMNS
+    num_tiles, num_samples, size = rays.distance.shape
+    group_size = surfels.row.shape[1]
+    factor = kernel.phase_scale(phase, g)
+
+    def one_batch(index, images):
+        chosen = index * batch + jnp.arange(batch)
+        valid = chosen < num_pairs
+        t = jnp.where(valid, lax.dynamic_slice_in_dim(tile, index * batch, batch), num_tiles)
+        k = jnp.where(valid, lax.dynamic_slice_in_dim(group, index * batch, batch), 0)
+        safe = jnp.minimum(t, num_tiles - 1)
+        direction = rays.direction[safe]
+        ray = (direction[:, 0], direction[:, 1], direction[:, 2])
+        distance = rays.distance[safe]
+        distances = [distance[:, n] for n in range(num_samples)]
+        factors = None
+        if transport is not None:
+            cells = rays.cell[safe]
+            cluster = surfels.cluster[k][:, None] * transport.shape[1]
+            factors = [transport.reshape(-1)[cluster + cells[:, n]] for n in range(num_samples)]
+        if rays.weight is not None:
+            weight = rays.weight[safe]
+            weights = [[weight[:, n, c] for n in range(num_samples)] for c in range(3)]
+            if factors is not None:
+                weights = [[w * f for w, f in zip(channel, factors, strict=True)] for channel in weights]
+        rows = surfels.row[k]
+
+        def one_surfel(m, sums):
+            row = lax.dynamic_index_in_dim(rows, m, 1, keepdims=False)
+            surfel = {name: row[:, i : i + 1] for i, name in enumerate(names)}
+            values = kernel.pair_samples(ray, distances, surfel, phase=phase, g=g, table=table)
+            colours = [surfel[name] for name in ("red", "green", "blue")]
+            if rays.weight is not None:
+                totals = [sum(v * w for v, w in zip(values, channel, strict=True)) for channel in weights]
+                return tuple(s + c * total for s, c, total in zip(sums, colours, totals, strict=True))
+            if factors is not None:
+                values = [v * f for v, f in zip(values, factors, strict=True)]
+            total = sum(values[1:], start=values[0])
+            return tuple(s + c * total for s, c in zip(sums, colours, strict=True))
+
+        zero = jnp.zeros((batch, size), jnp.float32)
+        sums = lax.fori_loop(0, group_size, one_surfel, (zero, zero, zero))
+        return tuple(i.at[t].add(s, mode="drop") for i, s in zip(images, sums, strict=True))
+
+    blank = jnp.zeros((num_tiles, size), jnp.float32)
+    num_batches = (num_pairs + batch - 1) // batch
+    images = lax.fori_loop(0, num_batches, one_batch, (blank, blank, blank))
+    return factor * jnp.stack(images, axis=1)
