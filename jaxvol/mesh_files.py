@@ -34,6 +34,7 @@ MALFORMED = (
     RecursionError,
     OverflowError,
     ZeroDivisionError,
+    ImportError,  # trimesh looks for packages that guess the encoding of broken text
 )
 
 
@@ -62,8 +63,7 @@ def read_mesh(path: Path) -> Triangles:
         data, notes = _obj_for_trimesh(data, path)
     if suffix == ".stl":
         _check_stl(data, path)
-    if suffix == ".ply":
-        _check_ply(data, path)
+    least = _num_ply_faces(data, path) if suffix == ".ply" else 1
     materials = _gltf_materials(data, path) if suffix in (".glb", ".gltf") else {}
     log = logging.getLogger("trimesh")
     level, log.level = log.level, logging.CRITICAL  # its warnings on broken files print tracebacks; the error below says it
@@ -79,6 +79,8 @@ def read_mesh(path: Path) -> Triangles:
     if not parts:
         raise ValueError(f"{path} holds no triangles")
     merged = merge(parts)
+    if len(merged.faces) < least:
+        raise ValueError(f"{path} is truncated: {len(merged.faces)} of {least} faces")
     _check(merged, path)
     return replace(merged, notes=tuple(notes))
 
@@ -253,21 +255,28 @@ def _missing_materials(path: Path, name: str) -> list[str]:
 def _check_stl(data: bytes, path: Path) -> None:
     """A binary STL is exactly as long as its triangle count says."""
     if data[:5].lower() == b"solid" and b"facet" in data[:1024]:
+        if not data.isascii() or b"endsolid" not in data[-1024:]:
+            raise ValueError(f"{path} is a text STL file that is truncated or damaged")
         return
     said = 84 + 50 * struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else None
     if said != len(data):
         raise ValueError(f"{path} is truncated or no STL file ({len(data)} bytes, {said} expected)")
 
 
-def _check_ply(data: bytes, path: Path) -> None:
-    """No element list may claim more entries than the file has bytes."""
+def _num_ply_faces(data: bytes, path: Path) -> int:
+    """The number of faces that the header claims; no list may claim more entries than the file has bytes."""
     end = data.find(b"end_header")
     if data[:3] != b"ply" or end < 0:
         raise ValueError(f"{path} is no PLY file (its header is missing or cut off)")
+    counts = {}
     for line in data[:end].decode("ascii", errors="replace").splitlines():
         words = line.split()
-        if words[:1] == ["element"] and (len(words) != 3 or not words[2].isdigit() or int(words[2]) > len(data)):
+        if words[:1] != ["element"]:
+            continue
+        if len(words) != 3 or not words[2].isdigit() or int(words[2]) > len(data):
             raise ValueError(f"{path}: the header claims '{line}' in a file of {len(data)} bytes")
+        counts[words[1]] = int(words[2])
+    return counts.get("face", 0)
 
 
 def _gltf_materials(data: bytes, path: Path) -> dict[str, dict]:

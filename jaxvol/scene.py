@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from jaxvol import camera as cameras
-from jaxvol import image, lights, media, meshes, phase
+from jaxvol import image, lights, media, meshes, phase, volumes
 from jaxvol.scene_config import (
     CameraTable,
     InclusionTable,
@@ -231,8 +231,6 @@ def _density(key: str, table: InclusionTable, base: Path) -> tuple[np.ndarray | 
     value, name = table.density, f"{key}.density"
     if isinstance(value, float):
         return None, None, value
-    from jaxvol import volumes
-
     if isinstance(value, str):
         try:
             if value.startswith("builtin:"):
@@ -253,8 +251,6 @@ def _read_volume(path: Path) -> Any:
         raise ValueError(f"{path} is no volume format that is read here ({', '.join(MEDIUM_FILES)})")
     if not path.is_file():
         raise ValueError(f"file {path} does not exist")
-    from jaxvol import volumes
-
     return volumes.read_volume(path)
 
 
