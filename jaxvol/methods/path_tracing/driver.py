@@ -1,0 +1,160 @@
+"""Run steps until a range of samples is done: rays cast by Embree on the host between steps, or all on the device.
+
+On the CPU a Python loop casts with Embree between jitted steps. With pure JAX casters (BVH, brute force) the same step
+and the same casting order run under `lax.while_loop`, which is what an accelerator wants.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxvol import ray_casting, segments
+from jaxvol.methods.path_tracing import sensors
+from jaxvol.methods.path_tracing.lanes import Casts, Lanes, idle, num_columns
+from jaxvol.methods.path_tracing.step import Settings, Work, step
+from jaxvol.ray_casting import EmbreeCaster
+from jaxvol.types import Scene
+
+
+@partial(jax.jit, static_argnames=("settings",), donate_argnames=("film",))
+def _jit_step(scene, sensor, settings, seed, lanes, casts, work, film):
+    lanes, work, film = step(scene, sensor, settings, seed, lanes, casts, work, film)
+    return lanes, work, film, jnp.any(lanes.alive | lanes.finished.valid)
+
+
+def no_casts(lanes: Lanes) -> Casts:
+    """Casts of a scene without surfaces: every ray misses."""
+    n = lanes.alive.shape[0]
+    return Casts(
+        t=jnp.full(n, jnp.inf, jnp.float32),
+        face=jnp.full(n, -1, jnp.int32),
+        blocked=tuple(jnp.zeros(n, bool) for _ in lanes.shadows),
+    )
+
+
+def cast_all(scene: Scene, casters, medium_casters, lanes: Lanes, settings: Settings, max_spans: int) -> Casts:
+    """Cast the path and shadow rays of every lane, with any caster; jittable for JAX casters."""
+    casts = no_casts(lanes)
+    far = jnp.full(lanes.alive.shape, jnp.inf, jnp.float32)
+    if scene.mesh is not None:
+        t, face = ray_casting.intersect(casters, lanes.origin, lanes.direction, far)
+        blocked = tuple(ray_casting.occluded(casters, s.origin, s.direction, s.distance) for s in lanes.shadows)
+        casts = Casts(t=t, face=face, blocked=blocked)
+    if not settings.bounded:
+        return casts
+    cut = lambda o, d, t: _cut(scene, medium_casters, o, d, t, max_spans)  # noqa: E731
+    return eqx.tree_at(
+        lambda c: (c.path_spans, c.shadow_spans),
+        casts,
+        (
+            cut(lanes.origin, lanes.direction, far),
+            tuple(cut(s.origin, s.direction, s.distance) for s in lanes.shadows),
+        ),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def _cut(scene, medium_casters, origin, direction, t_max, max_spans):
+    found = segments.segments(
+        scene.medium, origin, direction, t_max, casters=medium_casters, max_hits=max_spans, max_segments=max_spans
+    )
+    return found.t, found.region
+
+
+def _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spans):
+    """Host casting: only what is new, active and needed; numpy arrays, updated in place."""
+    fresh = np.asarray(lanes.recast) & np.asarray(lanes.alive)
+    origin, direction = np.asarray(lanes.origin), np.asarray(lanes.direction)
+    index = np.flatnonzero(fresh)
+    if scene.mesh is not None and index.size:
+        far = np.full(index.size, np.inf, np.float32)
+        casts.t[index], casts.face[index] = ray_casting.intersect(caster, origin[index], direction[index], far)
+    if settings.bounded and index.size:
+        far = np.full(index.size, np.inf, np.float32)
+        t, region = _cut(scene, medium_casters, origin[index], direction[index], far, max_spans)
+        casts.path_spans[0][index], casts.path_spans[1][index] = t, region
+    recast = np.asarray(lanes.recast)
+    for number, shadow in enumerate(lanes.shadows):
+        index = np.flatnonzero(np.asarray(shadow.active) & recast)
+        if not index.size:
+            continue
+        origin, direction, distance = (np.asarray(x)[index] for x in (shadow.origin, shadow.direction, shadow.distance))
+        if scene.mesh is not None:
+            casts.blocked[number][index] = ray_casting.occluded(caster, origin, direction, distance)
+        if settings.bounded:
+            t, region = _cut(scene, medium_casters, origin, direction, distance, max_spans)
+            casts.shadow_spans[number][0][index], casts.shadow_spans[number][1][index] = t, region
+    return casts
+
+
+def _host_casts(num_lanes, num_shadows, settings, max_spans):
+    spans = lambda: (  # noqa: E731
+        np.zeros((num_lanes, max_spans + 1), np.float32),
+        np.full((num_lanes, max_spans), -1, np.int32),
+    )
+    return Casts(
+        t=np.full(num_lanes, np.inf, np.float32),
+        face=np.full(num_lanes, -1, np.int32),
+        blocked=tuple(np.zeros(num_lanes, bool) for _ in range(num_shadows)),
+        path_spans=spans() if settings.bounded else None,
+        shadow_spans=tuple(spans() for _ in range(num_shadows)) if settings.bounded else None,
+    )
+
+
+def run(
+    scene: Scene,
+    sensor: sensors.Sensor,
+    settings: Settings,
+    *,
+    groups: tuple[int, ...],
+    num_shadows: int,
+    num_lanes: int,
+    max_spans: int,
+    kind: str,
+    seed: int,
+    first_pixel: int,
+    num_pixels: int,
+    first_sample: int,
+    num_samples: int,
+    on_step=None,
+):
+    """Trace `num_samples` samples of each of `num_pixels` pixels; the film [2 * num_pixels, columns] as numpy.
+
+    `on_step(done_share)` is called now and then (host loop only) and stops the run early by raising.
+    """
+    caster = ray_casting.caster_for(scene.mesh, kind=kind)
+    medium_casters = segments.medium_casters(scene.medium, kind=kind) if settings.bounded else ()
+    lanes = idle(num_lanes, groups=groups, num_shadows=num_shadows, tracked=settings.tracked)
+    film = jnp.zeros((2 * num_pixels, num_columns(groups)), jnp.float32)
+    items = num_pixels * num_samples
+    work = Work(jnp.uint32(0), jnp.uint32(items), jnp.uint32(first_sample), jnp.int32(first_pixel), num_pixels)
+    seed = jnp.uint32(seed)
+    uses_embree = isinstance(caster, EmbreeCaster) or any(isinstance(c, EmbreeCaster) for c in medium_casters)
+    if not uses_embree:
+        return np.asarray(_device_loop(scene, sensor, settings, seed, lanes, work, film, caster, medium_casters, max_spans))
+    casts = _host_casts(num_lanes, num_shadows, settings, max_spans)
+    count = 0
+    busy = True
+    while busy:
+        lanes, work, film, busy = _jit_step(scene, sensor, settings, seed, lanes, casts, work, film)
+        casts = _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spans)
+        count += 1
+        if on_step is not None and count % 16 == 0:
+            on_step(min(int(work.next), items) / items)
+    return np.asarray(film)
+
+
+@partial(jax.jit, static_argnames=("settings", "max_spans"), donate_argnames=("film",))
+def _device_loop(scene, sensor, settings, seed, lanes, work, film, caster, medium_casters, max_spans):
+    def body(state):
+        lanes, work, film, _ = state
+        casts = cast_all(scene, caster, medium_casters, lanes, settings, max_spans)
+        lanes, work, film = step(scene, sensor, settings, seed, lanes, casts, work, film)
+        return lanes, work, film, jnp.any(lanes.alive | lanes.finished.valid)
+
+    state = (lanes, work, film, jnp.array(True))
+    return lax.while_loop(lambda s: s[3], body, state)[2]

@@ -1,0 +1,267 @@
+"""Plan, run and turn the film into layers with their variance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from jaxvol import layers as layer_classes
+from jaxvol import lights, media, segments
+from jaxvol.layers import Claim
+from jaxvol.methods.path_tracing import driver, sensors
+from jaxvol.methods.path_tracing.lanes import (
+    EMISSION,
+    FROM_MULTIPLE,
+    FROM_SURFACE,
+    FROM_VOLUME,
+    SURFACE_LIGHT,
+    VOLUME_LIGHT,
+    possible_groups,
+)
+from jaxvol.methods.path_tracing.step import Settings
+from jaxvol.types import Camera, Estimate, Layers, Medium, Rays, Scene
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is decided before tracing, from the scene's structure and values."""
+
+    settings: Settings
+    groups: tuple[int, ...]
+    num_shadows: int
+    num_lanes: int  # at most
+    max_spans: int
+    caster: str
+    drop_medium: bool  # the medium scatters and absorbs nothing
+    skipped: tuple[str, ...]
+
+
+def claims(scene: Scene) -> tuple[Claim, ...]:
+    """All nine layers, each complete."""
+    return tuple(Claim((name,)) for name in layer_classes.NAMES)
+
+
+def plan(
+    scene: Scene,
+    camera: sensors.Sensor,
+    *,
+    max_scatterings: int = 1_000_000,
+    roulette_from: int = 6,
+    num_lanes: int = 1 << 14,
+    tracking_steps: int = 8,
+    max_spans: int = 8,
+    equiangular: bool | None = None,
+    caster: str = "auto",
+) -> Plan:
+    """Decide what a path tracer of this scene has to do; eager.
+
+    `max_scatterings` counts vertices of any kind; `roulette_from` is the number of vertices from which Russian roulette
+    may end a path; `equiangular=None` uses equi-angular distances where point or spot lights stand in or near a
+    homogeneous medium. Raises ValueError for a refractive index other than 1 and for counts out of range.
+    """
+    if max_scatterings < 0:
+        raise ValueError(f"max_scatterings: {max_scatterings} is not allowed, must be >= 0")
+    if roulette_from < 1:
+        raise ValueError(f"roulette_from: {roulette_from} is not allowed, must be >= 1")
+    if tracking_steps < 1 or max_spans < 1:
+        raise ValueError("tracking_steps and max_spans must be >= 1")
+    if scene.medium is not None:
+        _refuse_refraction(scene.medium)
+    drop_medium = scene.medium is not None and media.is_empty(scene.medium)
+    medium = None if drop_medium else scene.medium
+    tracked = medium is not None and not media.is_homogeneous(medium)
+    lit = lights.num_lights(scene) > 0
+    near = medium is not None and _point_light_near(scene, medium)
+    use_equiangular = near and not tracked if equiangular is None else equiangular
+    if use_equiangular and (tracked or medium is None or (scene.point_lights is None and scene.spot_lights is None)):
+        raise ValueError("equiangular: true needs a homogeneous medium and a point or spot light")
+    settings = Settings(
+        max_scatterings=min(max_scatterings, 1_000_000) if lit else 0,
+        roulette_from=roulette_from,
+        tracked=tracked,
+        tracking_steps=tracking_steps,
+        bounded=medium is not None and not segments.is_box(medium),
+        equiangular=use_equiangular and lit,
+    )
+    return Plan(
+        settings=settings,
+        groups=possible_groups(has_mesh=scene.mesh is not None, has_medium=medium is not None),
+        num_shadows=(2 if settings.equiangular else 1) if lit else 0,
+        num_lanes=num_lanes,
+        max_spans=max_spans if settings.bounded else 1,
+        caster=caster,
+        drop_medium=drop_medium,
+        skipped=_skipped(scene, medium, drop_medium, settings, lit),
+    )
+
+
+def _refuse_refraction(medium: Medium) -> None:
+    for one in (medium, *medium.inclusions):
+        if one.ior is not None and float(np.max(np.abs(np.asarray(one.ior) - 1.0))) > 1e-6:
+            raise ValueError(
+                f"medium.refractive_index: {float(np.max(np.asarray(one.ior))):g} is not allowed here, path_tracing "
+                "keeps rays straight and takes 1 only; lattice_boltzmann bends them"
+            )
+
+
+def _point_light_near(scene, medium):
+    """Whether a point-like light stands within the medium's box enlarged by half its size."""
+    bounds = np.asarray(medium.bounds)
+    margin = 0.5 * (bounds[1] - bounds[0])
+    positions = [np.asarray(x.position) for x in (scene.point_lights, scene.spot_lights) if x is not None]
+    return any(np.any(np.all((p > bounds[0] - margin) & (p < bounds[1] + margin), axis=-1)) for p in positions)
+
+
+def _skipped(scene, medium, drop_medium, settings, lit):
+    reasons = []
+    if not lit:
+        reasons.append("no light: nothing is traced beyond the first hit")
+    if scene.mesh is None:
+        reasons.append("no surfaces: no rays are cast, surface layers are exactly zero")
+    if drop_medium:
+        reasons.append("the medium neither scatters nor absorbs: dropped")
+    elif medium is None:
+        reasons.append("no medium: no free flights, volume layers are exactly zero")
+    elif not settings.tracked:
+        reasons.append("homogeneous media: flights and transmittance in closed form, no tracking")
+    if medium is not None and not settings.bounded:
+        reasons.append("the medium fills its box: one span a ray, no boundary crossings")
+    if medium is not None and not settings.equiangular:
+        reasons.append("no equi-angular sampling: no point or spot light near a homogeneous medium")
+    return tuple(reasons)
+
+
+def _run(scene, sensor, plan, *, seed, num_samples, first_sample=0, on_progress=None):
+    """Film of all pixels, in ranges of pixels that keep memory bounded."""
+    if plan.drop_medium:
+        scene = Scene(**{**{f: getattr(scene, f) for f in Scene.__dataclass_fields__}, "medium": None})
+    total = sensors.num_pixels(sensor)
+    films = []
+    chunk = 1 << 18
+    for first in range(0, total, chunk):
+        count = min(chunk, total - first)
+        report = None
+        if on_progress is not None:
+            report = lambda share, first=first, count=count: on_progress((first + share * count) / total)  # noqa: E731
+        films.append(
+            driver.run(
+                scene,
+                sensor,
+                plan.settings,
+                groups=plan.groups,
+                num_shadows=plan.num_shadows,
+                num_lanes=_lanes_for(count * num_samples, plan.num_lanes),
+                max_spans=plan.max_spans,
+                kind=plan.caster,
+                seed=seed,
+                first_pixel=first,
+                num_pixels=count,
+                first_sample=first_sample,
+                num_samples=num_samples,
+                on_step=report,
+            ).reshape(2, count, -1)
+        )
+    return np.concatenate(films, axis=1)
+
+
+def _lanes_for(items, limit):
+    """Lanes in powers of four, so that renders of all sizes share a few compilations."""
+    lanes = 256
+    while lanes < limit and lanes * 8 < items:
+        lanes *= 4
+    return min(lanes, limit)
+
+
+def film_to_layers(film: np.ndarray, groups: tuple[int, ...], num_samples: int) -> tuple[dict, dict]:
+    """Means and variances of the mean of each layer [P, 3], with the total under "total"; numpy float32.
+
+    The variance is that of independent samples: (E[x^2] - E[x]^2) / (n - 1); 0 for a single sample.
+    """
+    width = len(groups) + 1
+    values = film.astype(np.float64).reshape(2, film.shape[1], 2, width, 3)
+    both = values.sum(axis=0)
+    column = {group: i for i, group in enumerate(groups)}
+    sources = {"total": both[:, :, -1]}
+    for name, group in (("emission", EMISSION), ("surface_from_light", SURFACE_LIGHT), ("volume_from_light", VOLUME_LIGHT)):
+        if group in column:
+            sources[name] = both[:, :, column[group]]
+    for row, kind, present in ((0, "surface", SURFACE_LIGHT in column), (1, "volume", VOLUME_LIGHT in column)):
+        for source, group in (("surface", FROM_SURFACE), ("volume", FROM_VOLUME), ("multiple", FROM_MULTIPLE)):
+            if present and group in column:
+                sources[f"{kind}_from_{source}"] = values[row][:, :, column[group]]
+    mean, variance = {}, {}
+    for name, columns in sources.items():
+        average = columns[:, 0] / num_samples
+        square = columns[:, 1] / num_samples
+        mean[name] = average.astype(np.float32)
+        variance[name] = (np.maximum(square - average**2, 0.0) / max(num_samples - 1, 1)).astype(np.float32)
+    return mean, variance
+
+
+def _estimate(film, plan, num_samples, shape) -> Estimate:
+    mean, variance = film_to_layers(film, plan.groups, num_samples)
+    zeros = np.zeros((film.shape[1], 3), np.float32)
+    full = lambda found: Layers(  # noqa: E731
+        **{name: jnp.asarray(found.get(name, zeros).reshape(*shape, 3)) for name in layer_classes.NAMES}
+    )
+    return Estimate(
+        mean=full(mean),
+        variance=full(variance),
+        num_samples=jnp.float32(num_samples),
+        diagnostics={"variance_of_total": jnp.asarray(variance["total"].reshape(*shape, 3))},
+    )
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    seed: int = 0,
+    samples: int = 64,
+    on_progress: Progress | None = None,
+) -> Estimate:
+    """The picture in all nine layers [H, W, 3] with the variance of each mean, from `samples` paths a pixel.
+
+    Unbiased. `on_progress(share)` is called as it goes. Raises ValueError for samples < 1.
+    """
+    if samples < 1:
+        raise ValueError(f"samples: {samples} is not allowed, must be >= 1")
+    film = _run(scene, camera, plan, seed=seed, num_samples=samples, on_progress=on_progress)
+    return _estimate(film, plan, samples, (camera.height, camera.width))
+
+
+def _sense(scene, sensor, shape, *, seed, samples, **options):
+    decided = plan(scene, sensor, **options)
+    film = _run(scene, sensor, decided, seed=seed, num_samples=samples)
+    return _estimate(film, decided, samples, shape)
+
+
+def radiance(scene: Scene, rays: Rays, *, seed: int = 0, samples: int = 64, **options) -> Estimate:
+    """Radiance arriving along rays [*batch], by layer, W/(m2 sr); `options` as in `plan`."""
+    shape = np.shape(rays.origin)[:-1]
+    flat = Rays(
+        *(jnp.asarray(x, jnp.float32).reshape(-1, *x.shape[len(shape) :]) for x in (rays.origin, rays.direction, rays.t_max))
+    )
+    return _sense(scene, sensors.RaySensor(flat), shape, seed=seed, samples=samples, **options)
+
+
+def irradiance(scene: Scene, points: ArrayLike, normals: ArrayLike, *, seed: int = 0, samples: int = 64, **options) -> Estimate:
+    """Irradiance on the side of the unit `normals` at points [*batch, 3], W/m2, by the class of path that arrives.
+
+    The layer `emission` holds light straight from the sources.
+    """
+    points, normals = jnp.asarray(points, jnp.float32), jnp.asarray(normals, jnp.float32)
+    sensor = sensors.IrradianceSensor(points.reshape(-1, 3), normals.reshape(-1, 3))
+    return _sense(scene, sensor, points.shape[:-1], seed=seed, samples=samples, **options)
+
+
+def fluence(scene: Scene, points: ArrayLike, *, seed: int = 0, samples: int = 64, **options) -> Estimate:
+    """Fluence at points [*batch, 3], W/m2, by the class of path that arrives; `emission` is unscattered light."""
+    points = jnp.asarray(points, jnp.float32)
+    sensor = sensors.FluenceSensor(points.reshape(-1, 3))
+    return _sense(scene, sensor, points.shape[:-1], seed=seed, samples=samples, **options)

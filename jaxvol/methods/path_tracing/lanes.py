@@ -1,0 +1,153 @@
+"""The state of many light paths traced side by side, and the film that collects finished ones.
+
+A lane holds one path from the eye. When it ends, the lane's sums move to `Finished`, the next work item starts in the
+same lane, and the finished sample is flushed to the film once its last shadow ray is resolved.
+
+A sample's radiance is kept by group; X is the type (surface or volume) of its first vertex from the eye:
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+EMISSION, SURFACE_LIGHT, VOLUME_LIGHT, FROM_SURFACE, FROM_VOLUME, FROM_MULTIPLE = range(6)
+NUM_GROUPS = 6  # emission; surface_from_light; volume_from_light; X_from_surface; X_from_volume; X_from_multiple
+
+Sums = tuple[Float[Array, "n 3"] | None, ...]  # by group; None where the scene cannot have it
+
+
+class Shadow(eqx.Module):
+    """A connection to a light whose visibility (and, in a grid, transmittance) is still to be found."""
+
+    origin: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]
+    distance: Float[Array, "n"]
+    contribution: Float[Array, "n 3"]  # what it adds if nothing is in between
+    group: Int[Array, "n"]
+    active: Bool[Array, "n"]
+    of_finished: Bool[Array, "n"]  # belongs to the sample in `Finished`
+    event: UInt[Array, "n"]  # of its sample, for the random numbers of tracking
+
+
+class Finished(eqx.Module):
+    """A sample whose path has ended."""
+
+    sums: Sums
+    pixel: Int[Array, "n"]
+    sample: UInt[Array, "n"]
+    first_volume: Bool[Array, "n"]
+    valid: Bool[Array, "n"]
+
+
+ON_SHADOW, ON_PATH, ARRIVED = range(3)
+
+
+class Flight(eqx.Module):
+    """Progress of a tracked flight through density grids: first along the shadow ray, then along the path."""
+
+    stage: Int[Array, "n"]  # ON_SHADOW, ON_PATH or ARRIVED (the path's flight has ended)
+    t: Float[Array, "n"]  # negative before the first step
+    span: Int[Array, "n"]
+    ratio: Float[Array, "n 3"]  # shadow: transmittance so far; path: null-collision probabilities over the hero's
+    hero: Int[Array, "n"]  # channel that decides the collisions of the path's flight
+    collided: Bool[Array, "n"]
+    region: Int[Array, "n"]  # medium of the collision
+    counter: UInt[Array, "n"]
+
+
+class Casts(eqx.Module):
+    """What ray casting found for the path ray and the shadow rays of each lane."""
+
+    t: Float[Array, "n"]
+    face: Int[Array, "n"]
+    blocked: tuple[Bool[Array, "n"], ...]  # one for each shadow slot
+    path_spans: tuple | None = None  # (t [n, K+1], region [n, K]) where meshes bound the media
+    shadow_spans: tuple[tuple, ...] | None = None
+
+
+class Lanes(eqx.Module):
+    """One path per lane."""
+
+    pixel: Int[Array, "n"]
+    sample: UInt[Array, "n"]
+    alive: Bool[Array, "n"]
+    starting: Bool[Array, "n"]  # a sensor that gathers from a solid angle has yet to be connected to a light
+    origin: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]
+    throughput: Float[Array, "n 3"]
+    pdf: Float[Array, "n"]  # solid-angle density of `direction`; 0 = the camera's, which no light sampling competes with
+    num_vertices: Int[Array, "n"]
+    first_volume: Bool[Array, "n"]
+    last_volume: Bool[Array, "n"]  # type of the vertex farthest from the eye
+    event: UInt[Array, "n"]  # numbers the sample's events for its random numbers
+    sums: Sums
+    shadows: tuple[Shadow, ...]
+    finished: Finished
+    flight: Flight | None
+    recast: Bool[Array, "n"]  # the rays are new and want casting
+
+
+def possible_groups(*, has_mesh: bool, has_medium: bool) -> tuple[int, ...]:
+    """The groups that paths of such a scene can fall into."""
+    surface = (SURFACE_LIGHT, FROM_SURFACE) if has_mesh else ()
+    volume = (VOLUME_LIGHT, FROM_VOLUME) if has_medium else ()
+    multiple = (FROM_MULTIPLE,) if has_mesh or has_medium else ()
+    return tuple(sorted((EMISSION, *surface, *volume, *multiple)))
+
+
+def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: bool) -> Lanes:
+    """Lanes without work: the next step fills them."""
+    n = num_lanes
+    f = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
+    i = lambda: jnp.zeros(n, jnp.int32)  # noqa: E731
+    u = lambda: jnp.zeros(n, jnp.uint32)  # noqa: E731
+    b = lambda: jnp.zeros(n, bool)  # noqa: E731
+    x = lambda: jnp.tile(jnp.array([1.0, 0.0, 0.0], jnp.float32), (n, 1))  # noqa: E731
+    sums = lambda: tuple(f(n, 3) if g in groups else None for g in range(NUM_GROUPS))  # noqa: E731
+    return Lanes(
+        pixel=i(),
+        sample=u(),
+        alive=b(),
+        starting=b(),
+        origin=f(n, 3),
+        direction=x(),
+        throughput=f(n, 3),
+        pdf=f(n),
+        num_vertices=i(),
+        first_volume=b(),
+        last_volume=b(),
+        event=u(),
+        sums=sums(),
+        shadows=tuple(Shadow(f(n, 3), x(), f(n), f(n, 3), i(), b(), b(), u()) for _ in range(num_shadows)),
+        finished=Finished(sums(), i(), u(), b(), b()),
+        flight=Flight(i(), f(n), i(), f(n, 3), i(), b(), i(), u()) if tracked else None,
+        recast=b(),
+    )
+
+
+def add_to_group(sums: Sums, group: Int[Array, "n"], value: Float[Array, "n 3"]) -> Sums:
+    """Add `value` to each lane's group."""
+    return tuple(None if old is None else old + jnp.where((group == g)[:, None], value, 0.0) for g, old in enumerate(sums))
+
+
+def group_after(num_vertices: Int[Array, "n"], first_volume: Bool[Array, "n"], last_volume: Bool[Array, "n"]):
+    """Group of light that joins a path of `num_vertices` whose first and last (farthest) vertices have these types."""
+    first = jnp.where(first_volume, VOLUME_LIGHT, SURFACE_LIGHT)
+    second = jnp.where(last_volume, FROM_VOLUME, FROM_SURFACE)
+    group = jnp.where(num_vertices == 1, first, jnp.where(num_vertices == 2, second, FROM_MULTIPLE))
+    return jnp.where(num_vertices == 0, EMISSION, group).astype(jnp.int32)
+
+
+def num_columns(groups: tuple[int, ...]) -> int:
+    """Columns of the film: sums and squares of every possible group, then of the total."""
+    return 6 * (len(groups) + 1)
+
+
+def flush(film: Float[Array, "rows columns"], finished: Finished, ready: Bool[Array, "n"], num_pixels: int):
+    """Add finished samples to the film: row = type of the first vertex * num_pixels + pixel."""
+    sums = jnp.concatenate([s for s in finished.sums if s is not None], axis=1)
+    total = sum(s for s in finished.sums if s is not None)
+    columns = jnp.concatenate([sums, total, sums * sums, total * total], axis=1)
+    row = finished.pixel + jnp.where(finished.first_volume, num_pixels, 0)
+    row = jnp.where(finished.valid & ready, row, film.shape[0])
+    return film.at[row].add(columns, mode="drop")

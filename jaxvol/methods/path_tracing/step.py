@@ -1,0 +1,410 @@
+"""One step of all paths: resolve shadow rays, fly, collect emission, connect to lights, scatter, refill.
+
+Pure and jitted; rays are cast between steps by the driver. Symbols as in the path integral: throughput = product of
+scattering and transmittance over densities; next-event estimation is combined with directional sampling, and
+equi-angular with free-flight distances, by the balance heuristic (Veach 1997; Kulla and Fajardo 2012).
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, UInt
+
+from jaxvol import lights, materials, phase, ray_casting, sampling
+from jaxvol.methods.path_tracing import flight as flights
+from jaxvol.methods.path_tracing import sensors
+from jaxvol.methods.path_tracing.tracking import path_spans, shadow_spans, take_off, track
+from jaxvol.methods.path_tracing.lanes import (
+    ARRIVED,
+    Casts,
+    Finished,
+    Lanes,
+    Shadow,
+    add_to_group,
+    flush,
+    group_after,
+)
+from jaxvol.types import Scene
+
+_STREAM = sampling.stream("path_tracing")
+_NEAR = 1.0 - 1e-4  # shadow rays end short of the light's own surface
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is static for one compilation of a step."""
+
+    max_scatterings: int
+    roulette_from: int  # number of vertices from which Russian roulette may end a path
+    tracked: bool  # some medium has a density grid: flights are tracked, a few tentative collisions a step
+    tracking_steps: int
+    bounded: bool  # meshes bound the media: the driver supplies spans
+    equiangular: bool
+
+
+class Work(eqx.Module):
+    """The queue of work items: item i is pixel i mod P, sample first_sample + i div P, of P pixels from first_pixel."""
+
+    next: UInt[Array, ""]
+    end: UInt[Array, ""]
+    first_sample: UInt[Array, ""]
+    first_pixel: Int[Array, ""]
+    num_pixels: int = eqx.field(static=True)
+
+
+def step(
+    scene: Scene, sensor: sensors.Sensor, settings: Settings, seed, lanes: Lanes, casts: Casts, work: Work, film
+) -> tuple[Lanes, Work, Float[Array, "rows columns"]]:
+    """Advance every lane by one event (or by a few tentative collisions towards it)."""
+    if settings.tracked:
+        lanes, through = track(scene, settings, seed, lanes, casts)
+    else:
+        through = _closed_form_transmittance(scene, settings, lanes, casts)
+    lanes = _resolve_shadows(lanes, casts, through)
+    pending = jnp.zeros(lanes.alive.shape, bool)
+    for shadow in lanes.shadows:
+        pending = pending | shadow.active
+    film = flush(film, lanes.finished, ~pending, work.num_pixels)
+    lanes = eqx.tree_at(lambda x: x.finished.valid, lanes, lanes.finished.valid & pending)
+    ready = lanes.alive & ~pending
+    if settings.tracked:
+        ready = ready & ((lanes.flight.stage == ARRIVED) | lanes.starting)
+    lanes, ended = _event(scene, sensor, settings, seed, lanes, casts, ready)
+    lanes, work = _refill(sensor, settings, seed, lanes, ended, work)
+    return lanes, work, film
+
+
+def _closed_form_transmittance(scene, settings, lanes, casts):
+    """Transmittance of the shadow rays, and that all of them are through."""
+    found = []
+    for number, shadow in enumerate(lanes.shadows):
+        if scene.medium is None:
+            found.append((None, shadow.active))
+            continue
+        spans = shadow_spans(scene, settings, shadow, casts, number)
+        found.append((jnp.exp(-flights.optical_thickness(scene.medium, spans)), shadow.active))
+    return tuple(found)
+
+
+def _resolve_shadows(lanes, casts, through):
+    """Add what lights contribute through the shadow rays that are done."""
+    sums, late, shadows = lanes.sums, lanes.finished.sums, []
+    for shadow, blocked, (transmittance, done) in zip(lanes.shadows, casts.blocked, through, strict=True):
+        value = shadow.contribution if transmittance is None else shadow.contribution * transmittance
+        value = jnp.where((done & ~blocked)[:, None], value, 0.0)
+        sums = add_to_group(sums, shadow.group, jnp.where(shadow.of_finished[:, None], 0.0, value))
+        late = add_to_group(late, shadow.group, jnp.where(shadow.of_finished[:, None], value, 0.0))
+        shadows.append(eqx.tree_at(lambda s: s.active, shadow, shadow.active & ~done))
+    return eqx.tree_at(lambda x: (x.sums, x.finished.sums, x.shadows), lanes, (sums, late, tuple(shadows)))
+
+
+class _Arrival(eqx.Module):
+    """Where a flight ended."""
+
+    collided: Array
+    position: Array
+    normal: Array  # geometric; of the surface
+    region: Array
+    weight: Array  # of the throughput
+    density: Array  # of the collision by free flight, 1/length (equi-angular MIS)
+    on_surface: Array
+    escaped: Array
+
+
+def _arrive(scene, settings, lanes, casts, ready, u) -> _Arrival:
+    ready = ready & ~lanes.starting
+    n = ready.shape[0]
+    collided = jnp.zeros(n, bool)
+    t, region = casts.t, jnp.full(n, -1, jnp.int32)
+    weight = jnp.ones((n, 3), jnp.float32)
+    density = jnp.zeros(n, jnp.float32)
+    if scene.medium is not None and settings.tracked:
+        flight = lanes.flight
+        collided, region = flight.collided, flight.region
+        t = jnp.where(collided, flight.t, casts.t)
+        share = flights.choose_channel(lanes.throughput, u[0])[1]
+        mean = jnp.maximum(jnp.sum(share * flight.ratio, axis=-1), 1e-37)
+        albedo = flights.albedo(scene.medium, region)
+        weight = jnp.where(collided[:, None], albedo, 1.0) * flight.ratio / mean[:, None]
+    elif scene.medium is not None:
+        spans = path_spans(scene, settings, lanes, casts)
+        t_flight, collided, region, weight, density = flights.sample_homogeneous(
+            scene.medium, spans, lanes.throughput, u[0], u[1]
+        )
+        t = jnp.where(collided, t_flight, casts.t)
+    collided = collided & ready
+    on_surface = ready & ~collided & (casts.face >= 0)
+    finite_t = jnp.where(collided | on_surface, t, 0.0)
+    hit = ray_casting.hits(scene.mesh, lanes.origin, lanes.direction, finite_t, jnp.where(on_surface, casts.face, -1))
+    position = jnp.where(on_surface[:, None], hit.position, lanes.origin + finite_t[:, None] * lanes.direction)
+    escaped = ready & ~collided & (casts.face < 0)
+    return _Arrival(collided, position, hit.normal, region, weight, density, on_surface, escaped)
+
+
+def _emission(scene, lanes, casts, arrival, throughput):
+    """Light met by the path itself: emissive faces and the environment, weighted against next-event estimation."""
+    if scene.area_lights is None and scene.environment is None:
+        return jnp.zeros_like(throughput)
+    radiance = jnp.zeros_like(throughput)
+    if scene.area_lights is not None:
+        emitted = lights.emitted_radiance(scene.mesh, casts.face, arrival.normal, lanes.direction)
+        radiance = jnp.where(arrival.on_surface[:, None], emitted, radiance)
+    if scene.environment is not None:
+        sky = lights.environment_radiance(scene.environment, lanes.direction)
+        radiance = jnp.where(arrival.escaped[:, None], sky, radiance)
+    face = jnp.where(arrival.on_surface, casts.face, -1)
+    other = lights.sample_light_pdf(scene, lanes.origin, lanes.direction, face, casts.t, arrival.normal)
+    chosen = lanes.pdf > 0
+    mis = jnp.where(chosen, lanes.pdf / jnp.maximum(lanes.pdf + other, 1e-37), 1.0)
+    return throughput * radiance * mis[:, None]
+
+
+def _event(scene, sensor, settings, seed, lanes, casts, ready):
+    """What happens where flights end: light is met, a vertex is connected to a light, and the path scatters or ends."""
+    draw = lambda block: sampling.uniforms(seed, _STREAM, lanes.pixel, lanes.event * 8 + block, lanes.sample)  # noqa: E731
+    flight_u, light_u, scatter_u = draw(0), draw(1), draw(2)
+    arrival = _arrive(scene, settings, lanes, casts, ready, flight_u)
+    throughput = lanes.throughput * arrival.weight
+    count = lanes.num_vertices
+    # `group` of light that joins the path as it stands; the last vertex' type rides in `lanes.last_volume`.
+    group = group_after(count, lanes.first_volume, lanes.last_volume)
+    met = _emission(scene, lanes, casts, arrival, throughput)
+    gone = arrival.on_surface | arrival.escaped
+    sums = add_to_group(lanes.sums, group, jnp.where(gone[:, None], met, 0.0))
+
+    vertex = (arrival.collided | arrival.on_surface) & (count < settings.max_scatterings)
+    first_volume = jnp.where(vertex & (count == 0), arrival.collided, lanes.first_volume)
+    last_volume = jnp.where(vertex, arrival.collided, lanes.last_volume)
+    count = count + vertex.astype(jnp.int32)
+    surface = None if scene.mesh is None else materials.surface_at(scene.mesh, casts.face)
+
+    shadows = lanes.shadows
+    if shadows:
+        shadow = _connect(
+            scene,
+            sensor,
+            settings,
+            lanes,
+            casts,
+            arrival,
+            throughput,
+            surface,
+            vertex,
+            light_u,
+            group_after(count, first_volume, last_volume),
+        )
+        shadows = (_replace(shadows[0], shadow, ready), *shadows[1:])
+    if settings.equiangular:
+        extra = _connect_equiangular(scene, settings, lanes, casts, ready, draw(3))
+        shadows = (shadows[0], _replace(shadows[1], extra, ready))
+
+    direction, weight, pdf = _scatter(scene, lanes, arrival, surface, scatter_u)
+    scattered = throughput * weight
+    keep = jnp.max(scattered, axis=-1)
+    survival = jnp.where(count >= settings.roulette_from, jnp.clip(keep, 0.02, 1.0), 1.0)
+    alive = vertex & (scatter_u[3] < survival) & (keep > 0)
+    if scene.area_lights is None and scene.environment is None:
+        alive = alive & (count < settings.max_scatterings)  # nothing to be met by a last flight
+    scattered = scattered / survival[:, None]
+    origin = arrival.position
+    if scene.mesh is not None:
+        off = ray_casting.offset_origin(arrival.position, arrival.normal, direction, scale=ray_casting.scene_scale(scene.mesh))
+        origin = jnp.where(arrival.on_surface[:, None], off, origin)
+    go = vertex & alive
+    ended = ready & ~lanes.starting & ~go
+    pick = lambda new, old: jnp.where(go[:, None] if new.ndim == 2 else go, new, old)  # noqa: E731
+    lanes = eqx.tree_at(
+        lambda x: (
+            x.sums,
+            x.shadows,
+            x.origin,
+            x.direction,
+            x.throughput,
+            x.pdf,
+            x.num_vertices,
+            x.first_volume,
+            x.last_volume,
+            x.event,
+            x.starting,
+            x.recast,
+        ),
+        lanes,
+        (
+            sums,
+            shadows,
+            pick(origin, lanes.origin),
+            pick(direction, lanes.direction),
+            pick(scattered, lanes.throughput),
+            pick(pdf, lanes.pdf),
+            count,
+            first_volume,
+            last_volume,
+            lanes.event + ready.astype(jnp.uint32),
+            lanes.starting & ~ready,
+            ready,
+        ),
+    )
+    if settings.tracked:
+        lanes = take_off(lanes, ready, draw(4)[0])
+    return lanes, ended
+
+
+def _replace(old: Shadow, new: Shadow, ready):
+    pick = lambda a, b: jnp.where(ready[:, None] if a.ndim == 2 else ready, a, b)  # noqa: E731
+    return Shadow(*(pick(getattr(new, f), getattr(old, f)) for f in Shadow.__dataclass_fields__))
+
+
+def _connect(scene, sensor, settings, lanes, casts, arrival, throughput, surface, vertex, u, group) -> Shadow:
+    """Next-event estimation at the vertex just made, or at a gathering sensor's own point."""
+    position = jnp.where(lanes.starting[:, None], lanes.origin, arrival.position)
+    found = lights.sample_light(scene, position, u[0], u[1], u[2])
+    value = jnp.zeros_like(throughput)
+    pdf = jnp.zeros_like(found.pdf)
+    active = vertex
+    if scene.medium is not None:
+        scattered = flights.phase_value(scene.medium, arrival.region, sampling.dot(lanes.direction, found.direction))
+        value = jnp.where(arrival.collided[:, None], scattered[:, None] * throughput, value)
+        pdf = jnp.where(arrival.collided, scattered, pdf)
+    if scene.mesh is not None:
+        bsdf = materials.evaluate(surface, arrival.normal, lanes.direction, found.direction)
+        cosine = jnp.abs(sampling.dot(arrival.normal, found.direction))
+        value = jnp.where(arrival.on_surface[:, None], bsdf * cosine[:, None] * throughput, value)
+        surface_pdf = materials.sample_pdf(surface, arrival.normal, lanes.direction, found.direction)
+        pdf = jnp.where(arrival.on_surface, surface_pdf, pdf)
+    if sensors.sees_light(sensor):
+        weight, own = sensors.response(sensor, lanes.pixel, found.direction)
+        value = jnp.where(lanes.starting[:, None], weight[:, None], value)
+        pdf = jnp.where(lanes.starting, own, pdf)
+        active = active | lanes.starting
+    mis = jnp.where(found.delta, 1.0, found.pdf / jnp.maximum(found.pdf + pdf, 1e-37))
+    if settings.equiangular:
+        # A point light's light could also have been found by choosing this distance towards it.
+        other = _equiangular_density(scene, settings, lanes, casts, arrival, found)
+        own = arrival.density / lights.num_lights(scene)
+        mis = jnp.where(
+            arrival.collided & found.delta & jnp.isfinite(found.distance), own / jnp.maximum(own + other, 1e-37), mis
+        )
+    contribution = value * found.radiance * (mis / jnp.maximum(found.pdf, 1e-37))[:, None]
+    origin = position
+    if scene.mesh is not None:
+        off = ray_casting.offset_origin(position, arrival.normal, found.direction, scale=ray_casting.scene_scale(scene.mesh))
+        origin = jnp.where(arrival.on_surface[:, None], off, origin)
+    active = active & (jnp.max(contribution, axis=-1) > 0)
+    return Shadow(
+        origin, found.direction, found.distance * _NEAR, contribution, group, active, jnp.zeros_like(active), lanes.event
+    )
+
+
+def _point_like(scene: Scene) -> Scene:
+    """The lights that equi-angular sampling aims at."""
+    return Scene(point_lights=scene.point_lights, spot_lights=scene.spot_lights)
+
+
+def _media_range(spans):
+    """First entry into and last exit from the media."""
+    return spans[0][:, 0], spans[0][:, -1]
+
+
+def _equiangular_density(scene, settings, lanes, casts, arrival, found):
+    """Density of reaching the vertex by equi-angular sampling towards the light that was chosen for it."""
+    t0, t1 = _media_range(path_spans(scene, settings, lanes, casts))
+    t = sampling.dot(arrival.position - lanes.origin, lanes.direction)
+    pdf = sampling.sample_equiangular_pdf(t, lanes.origin, lanes.direction, t0, t1, found.position)
+    return pdf / lights.num_lights(_point_like(scene))
+
+
+def _connect_equiangular(scene, settings, lanes, casts, ready, u) -> Shadow:
+    """One more vertex on the same flight, at a distance chosen equi-angularly towards a point or spot light."""
+    lit = _point_like(scene)
+    ready = ready & ~lanes.starting & (lanes.num_vertices < settings.max_scatterings)
+    zero = jnp.zeros_like(u[0])
+    target = lights.sample_light(lit, lanes.origin, zero + 0.5, zero + 0.5, u[1]).position
+    spans = path_spans(scene, settings, lanes, casts)
+    t0, t1 = _media_range(spans)
+    t, pdf = sampling.sample_equiangular(u[0], lanes.origin, lanes.direction, t0, t1, target)
+    position = lanes.origin + t[:, None] * lanes.direction
+    found = lights.sample_light(lit, position, zero + 0.5, zero + 0.5, u[1])
+    density, through, region = flights.homogeneous_pdf(scene.medium, spans, lanes.throughput, t)
+    cosine = sampling.dot(lanes.direction, found.direction)
+    scattered = flights.phase_value(scene.medium, region, cosine)
+    # Balance heuristic against free flight followed by the choice of this light among all.
+    own = pdf * found.pdf
+    total = own + density / lights.num_lights(scene)
+    value = lanes.throughput * through * found.radiance * (scattered / jnp.maximum(total, 1e-37))[:, None]
+    active = ready & (t1 > t0) & (jnp.max(value, axis=-1) > 0)
+    ones = jnp.ones_like(ready)
+    first = jnp.where(lanes.num_vertices == 0, ones, lanes.first_volume)
+    group = group_after(lanes.num_vertices + 1, first, ones)
+    return Shadow(position, found.direction, found.distance * _NEAR, value, group, active, jnp.zeros_like(active), lanes.event)
+
+
+def _scatter(scene, lanes, arrival, surface, u):
+    """A new direction, its weight for the throughput, and its density."""
+    n = u[0].shape[0]
+    direction, pdf = lanes.direction, jnp.ones(n, jnp.float32)
+    weight = jnp.ones((n, 3), jnp.float32)
+    if scene.medium is not None:
+        direction, pdf = flights.sample_phase(scene.medium, arrival.region, lanes.direction, u[0], u[1])
+    if scene.mesh is not None:
+        out = materials.sample(surface, arrival.normal, lanes.direction, u[0], u[1], u[2])
+        out_pdf = materials.sample_pdf(surface, arrival.normal, lanes.direction, out)
+        value = materials.evaluate(surface, arrival.normal, lanes.direction, out)
+        cosine = jnp.abs(sampling.dot(arrival.normal, out))
+        reflected = value * (cosine / jnp.maximum(out_pdf, 1e-20))[:, None]
+        at = arrival.on_surface
+        direction = jnp.where(at[:, None], out, direction)
+        pdf = jnp.where(at, out_pdf, pdf)
+        weight = jnp.where(at[:, None], reflected, weight)
+    return direction, weight, pdf
+
+
+def _refill(sensor, settings, seed, lanes, ended, work):
+    """Move ended samples to `finished` and start the next work items in their lanes."""
+    free = ended | ~lanes.alive
+    for shadow in lanes.shadows:  # a sample still in `finished` must leave before the lane is used again
+        free = free & (ended | ~shadow.active)
+    finished = lanes.finished
+    pick = lambda new, old: jnp.where(ended[:, None] if new.ndim == 2 else ended, new, old)  # noqa: E731
+    finished = Finished(
+        sums=tuple(None if old is None else pick(new, old) for new, old in zip(lanes.sums, finished.sums, strict=True)),
+        pixel=pick(lanes.pixel, finished.pixel),
+        sample=pick(lanes.sample, finished.sample),
+        first_volume=pick(lanes.first_volume, finished.first_volume),
+        valid=finished.valid | ended,
+    )
+    shadows = tuple(
+        eqx.tree_at(lambda s: s.of_finished, shadow, shadow.of_finished | (ended & shadow.active)) for shadow in lanes.shadows
+    )
+    item = work.next + jnp.cumsum(free.astype(jnp.uint32)) - jnp.uint32(1)
+    start = free & (item < work.end)
+    sample = work.first_sample + item // jnp.uint32(work.num_pixels)
+    pixel = (item % jnp.uint32(work.num_pixels)).astype(jnp.int32) + work.first_pixel
+    pixel = jnp.where(start, pixel, lanes.pixel)
+    sample = jnp.where(start, sample, lanes.sample)
+    u1, u2, u3, _ = sampling.uniforms(seed, _STREAM, pixel, jnp.uint32(7), sample)
+    origin, direction, weight, pdf = sensors.sample_ray(sensor, pixel, u1, u2)
+    new = lambda a, b: jnp.where(start[:, None] if jnp.ndim(b) == 2 else start, a, b)  # noqa: E731
+    lanes = Lanes(
+        pixel=pixel,
+        sample=sample,
+        alive=(lanes.alive & ~ended) | start,
+        starting=new(sensors.sees_light(sensor) and bool(lanes.shadows), lanes.starting),
+        origin=new(origin, lanes.origin),
+        direction=new(direction, lanes.direction),
+        throughput=new(weight[:, None], lanes.throughput),
+        pdf=new(pdf, lanes.pdf),
+        num_vertices=new(0, lanes.num_vertices),
+        first_volume=new(False, lanes.first_volume),
+        last_volume=new(False, lanes.last_volume),
+        event=new(jnp.uint32(1), lanes.event),
+        sums=tuple(None if s is None else jnp.where((start | ended)[:, None], 0.0, s) for s in lanes.sums),
+        shadows=shadows,
+        finished=finished,
+        flight=lanes.flight,
+        recast=lanes.recast | start,
+    )
+    if settings.tracked:
+        lanes = take_off(lanes, start, u3)
+    count = jnp.sum(start.astype(jnp.uint32))
+    return lanes, eqx.tree_at(lambda w: w.next, work, work.next + count)
