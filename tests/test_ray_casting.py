@@ -70,7 +70,7 @@ def test_nearest_hits_match_float64(kind):
     mesh = random_triangles(0, 120)
     origin, direction = random_rays(1, 3000)
     t, face, margin = nearest_hit_float64(mesh, origin, direction)
-    got_t, got_face = ray_casting.intersect(ray_casting.make_caster(mesh, kind=kind), origin, direction)
+    got_t, got_face = ray_casting.intersect(ray_casting.make_caster(mesh, kind=kind), origin, direction, np.inf)
     got_t, got_face = np.asarray(got_t), np.asarray(got_face)
     clear = margin > 1e-4  # rays that pass an edge or a sliver this close may go either way
     assert np.count_nonzero(clear) > 2000 and np.count_nonzero(clear & (face >= 0)) > 1000
@@ -88,7 +88,7 @@ def test_t_max_bounds_both_queries(kind):
     mesh = random_triangles(2, 60)
     caster = ray_casting.make_caster(mesh, kind=kind)
     origin, direction = random_rays(3, 1000)
-    t, face = (np.asarray(x) for x in ray_casting.intersect(caster, origin, direction))
+    t, face = (np.asarray(x) for x in ray_casting.intersect(caster, origin, direction, np.inf))
     for factor, expected in ((0.999, False), (1.001, True)):
         t_max = np.where(face >= 0, factor * t, 0.3).astype(np.float32)
         near_t, near_face = (np.asarray(x) for x in ray_casting.intersect(caster, origin, direction, t_max))
@@ -96,7 +96,7 @@ def test_t_max_bounds_both_queries(kind):
         assert np.array_equal(near_face >= 0, (face >= 0) & expected)
         assert np.array_equal(blocked, (face >= 0) & expected)
         assert np.all(np.isinf(near_t[near_face < 0]))
-    assert np.array_equal(np.asarray(ray_casting.occluded(caster, origin, direction)), face >= 0)
+    assert np.array_equal(np.asarray(ray_casting.occluded(caster, origin, direction, np.inf)), face >= 0)
     assert 100 < np.count_nonzero(face >= 0) < 900
 
 
@@ -113,10 +113,10 @@ def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(kind):
         origin = np.asarray(offset + rng.uniform(-0.5, 0.5, targets.shape), np.float32)
         direction = targets - origin
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        t, _ = ray_casting.intersect(caster, origin, direction)
+        t, _ = ray_casting.intersect(caster, origin, direction, np.inf)
         assert np.all(np.isfinite(np.asarray(t)))
         np.testing.assert_allclose(np.asarray(t), np.linalg.norm(targets - origin, axis=1), rtol=1e-5)
-        assert np.all(np.asarray(ray_casting.occluded(caster, origin, direction)))
+        assert np.all(np.asarray(ray_casting.occluded(caster, origin, direction, np.inf)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -133,15 +133,15 @@ def test_axis_parallel_rays_meet_a_box_on_its_face_diagonals(kind):
 def test_odd_batches_and_directions_of_any_length(kind):
     caster = ray_casting.make_caster(box_mesh((-1, -1, -1), (1, 1, 1)), kind=kind)
     origin = np.zeros((2, 3, 3), np.float32)
-    t, face = ray_casting.intersect(caster, origin, np.array([0.0, 0.0, 4.0], np.float32))
+    t, face = ray_casting.intersect(caster, origin, np.array([0.0, 0.0, 4.0], np.float32), np.inf)
     assert t.shape == face.shape == (2, 3)
     np.testing.assert_allclose(np.asarray(t), 0.25, rtol=1e-6)
-    t, face = ray_casting.intersect(caster, origin[:0], origin[:0])
+    t, face = ray_casting.intersect(caster, origin[:0], origin[:0], np.inf)
     assert t.shape == face.shape == (0, 3)
-    assert ray_casting.occluded(caster, origin[:0], origin[:0]).shape == (0, 3)
+    assert ray_casting.occluded(caster, origin[:0], origin[:0], np.inf).shape == (0, 3)
     nan = np.full((2, 3), np.nan, np.float32)
-    assert np.all(np.asarray(ray_casting.intersect(caster, nan, np.ones_like(nan))[1]) == -1)
-    assert np.asarray(ray_casting.occluded(caster, origin[0, 0], np.array([1.0, 0, 0], np.float32))).shape == ()
+    assert np.all(np.asarray(ray_casting.intersect(caster, nan, np.ones_like(nan), np.inf)[1]) == -1)
+    assert np.asarray(ray_casting.occluded(caster, origin[0, 0], np.array([1.0, 0, 0], np.float32), np.inf)).shape == ()
 
 
 def test_nothing_to_hit():
@@ -167,12 +167,12 @@ def test_unknown_kind_and_building_under_jit_are_refused():
 def test_threads_do_not_change_the_answer(threads):
     mesh = random_triangles(5, 80)
     origin, direction = random_rays(6, 20_001)
-    reference = ray_casting.intersect(ray_casting.make_caster(mesh, kind="embree", num_threads=1), origin, direction)
+    reference = ray_casting.intersect(ray_casting.make_caster(mesh, kind="embree", num_threads=1), origin, direction, np.inf)
     caster = ray_casting.make_caster(mesh, kind="embree", num_threads=threads)
     kept = origin.copy()
-    t, face = ray_casting.intersect(caster, origin, direction)
+    t, face = ray_casting.intersect(caster, origin, direction, np.inf)
     assert np.array_equal(t, reference[0]) and np.array_equal(face, reference[1])
-    assert np.array_equal(ray_casting.occluded(caster, origin, direction), face >= 0)
+    assert np.array_equal(ray_casting.occluded(caster, origin, direction, np.inf), face >= 0)
     assert np.array_equal(origin, kept)
     t_max = np.full(len(origin), 1.5, np.float32)
     ray_casting.intersect(caster, origin, direction, t_max)
@@ -197,16 +197,16 @@ def test_t_is_differentiable_under_jit(kind):
     mesh = random_triangles(7, 40)
     caster = ray_casting.make_caster(mesh, kind=kind)
     origin, direction = random_rays(8, 64)
-    _, face = ray_casting.intersect(caster, origin, direction)
+    _, face = ray_casting.intersect(caster, origin, direction, np.inf)
     hit = np.asarray(face) >= 0
 
     @jax.jit
     def total(shift):
-        t, _ = ray_casting.intersect(caster, origin + shift * direction, direction)
+        t, _ = ray_casting.intersect(caster, origin + shift * direction, direction, np.inf)
         return jnp.sum(jnp.where(hit, t, 0.0))
 
     np.testing.assert_allclose(jax.grad(total)(1e-4), -np.count_nonzero(hit), rtol=1e-4)
-    towards = jax.grad(lambda o: jnp.sum(jnp.where(hit, ray_casting.intersect(caster, o, direction)[0], 0.0)))(origin)
+    towards = jax.grad(lambda o: jnp.sum(jnp.where(hit, ray_casting.intersect(caster, o, direction, np.inf)[0], 0.0)))(origin)
     normal = np.asarray(ray_casting.face_normals(mesh))[np.asarray(face)]
     expected = np.where(hit[:, None], -normal / np.sum(normal * direction, -1, keepdims=True), 0.0)
     np.testing.assert_allclose(np.asarray(towards), expected, rtol=1e-3, atol=1e-3)
@@ -215,7 +215,7 @@ def test_t_is_differentiable_under_jit(kind):
 def test_hits_lie_on_their_faces_even_from_far_away():
     mesh = random_triangles(9, 60)
     origin, direction = random_rays(10, 2000, radius=300.0)
-    t, face = ray_casting.intersect(ray_casting.make_caster(mesh), origin, direction)
+    t, face = ray_casting.intersect(ray_casting.make_caster(mesh), origin, direction, np.inf)
     record = jax.jit(ray_casting.hits)(mesh, origin, direction, t, face)
     valid = np.asarray(record.valid)
     assert 100 < np.count_nonzero(valid) and np.array_equal(valid, face >= 0)
@@ -238,7 +238,7 @@ def test_offset_origins_do_not_hit_their_own_surface(size):
     caster = ray_casting.make_caster(mesh)
     origin, direction = random_rays(11, 4000, radius=0.9 * size)
     origin *= 0.9 / 2
-    t, face = ray_casting.intersect(caster, origin, direction)
+    t, face = ray_casting.intersect(caster, origin, direction, np.inf)
     record = ray_casting.hits(mesh, origin, direction, t, face)
     inward = -np.asarray(record.normal)
     rng = np.random.default_rng(12)
@@ -248,12 +248,12 @@ def test_offset_origins_do_not_hit_their_own_surface(size):
     leaving = np.where(cosine < 0, leaving - 2 * cosine * inward, leaving).astype(np.float32)
     scale = ray_casting.scene_scale(mesh)
     inside = ray_casting.offset_origin(record.position, record.normal, leaving, scale=scale)
-    t2, face2 = ray_casting.intersect(caster, inside, leaving)
+    t2, face2 = ray_casting.intersect(caster, inside, leaving, np.inf)
     assert np.all(face2 >= 0)
     normal = np.asarray(ray_casting.face_normals(mesh))
     assert np.all(np.sum(normal[face] * normal[face2], -1) < 0.5)  # another side of the box
     outside = ray_casting.offset_origin(record.position, record.normal, -leaving, scale=scale)
-    assert not np.any(ray_casting.occluded(caster, outside, -leaving))
+    assert not np.any(ray_casting.occluded(caster, outside, -leaving, np.inf))
 
 
 @pytest.mark.parametrize("kind", [k for k in KINDS if k != "embree"])
@@ -264,9 +264,9 @@ def test_casters_agree_on_the_bunny(kind, shared_data):
     origin = np.asarray(bunny.bounds.mean(0) + rng.normal(size=(512, 3)) * 0.2, np.float32)
     target = np.asarray(bunny.triangles_center[rng.integers(0, len(bunny.faces), 512)] + 0.01 * rng.normal(size=(512, 3)))
     direction = np.asarray((target - origin) / np.linalg.norm(target - origin, axis=1, keepdims=True), np.float32)
-    t, face = ray_casting.intersect(ray_casting.make_caster(mesh, kind="embree"), origin, direction)
+    t, face = ray_casting.intersect(ray_casting.make_caster(mesh, kind="embree"), origin, direction, np.inf)
     other = ray_casting.make_caster(mesh, kind=kind)
-    other_t, other_face = ray_casting.intersect(other, origin, direction)
+    other_t, other_face = ray_casting.intersect(other, origin, direction, np.inf)
     assert np.count_nonzero(np.asarray(other_face) != face) <= 1 and np.count_nonzero(face >= 0) > 250
     hit = (face >= 0) & (np.asarray(other_face) >= 0)
     np.testing.assert_allclose(np.asarray(other_t)[hit], t[hit], atol=1e-6)

@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol.ray_casting import brute_force, embree
+from jaxvol.ray_casting import brute_force, closed_meshes, embree
 from jaxvol.ray_casting.brute_force import BruteForce
+from jaxvol.ray_casting.closed_meshes import Crossings
 from jaxvol.ray_casting.embree import EmbreeCaster
 from jaxvol.ray_casting.surface_points import face_normals, hits, offset_origin, scene_scale
 from jaxvol.ray_casting.topology import num_bodies, outward_normals
@@ -27,8 +28,11 @@ __all__ = [
     "KINDS",
     "BruteForce",
     "Caster",
+    "Crossings",
     "EmbreeCaster",
+    "all_intersections",
     "caster_for",
+    "crossings",
     "face_normals",
     "hits",
     "intersect",
@@ -64,7 +68,7 @@ def make_caster(mesh: Mesh | None, *, kind: str = "auto", num_threads: int | Non
     normals = outward_normals(triangles)
     bodies = num_bodies(np.asarray(mesh.vertices), faces)
     if kind == "embree":
-        return EmbreeCaster(mesh.vertices, faces, normals, bodies, num_threads=num_threads)
+        return EmbreeCaster(mesh.vertices, faces, triangles, normals, bodies, num_threads=num_threads)
     return BruteForce(triangles=jnp.asarray(mesh.vertices)[faces], normals=jnp.asarray(normals), num_bodies=bodies)
 
 
@@ -84,7 +88,7 @@ def caster_for(mesh: Mesh | None, *, kind: str = "auto") -> Caster:
     return _casters[key][1]
 
 
-def intersect(caster: Caster, origin, direction, t_max=np.inf):
+def intersect(caster: Caster, origin, direction, t_max):
     """Nearest hit of rays `origin [*batch, 3]`, `direction [*batch, 3]`, `t_max [*batch]`, broadcast together.
 
     Returns (t, face), both `[*batch]`: t = inf and face = -1 on a miss. numpy from the Embree caster, else JAX arrays.
@@ -98,13 +102,32 @@ def intersect(caster: Caster, origin, direction, t_max=np.inf):
     return t.reshape(batch), face.reshape(batch)
 
 
-def occluded(caster: Caster, origin, direction, t_max=np.inf):
+def occluded(caster: Caster, origin, direction, t_max):
     """Whether anything lies on the rays before `t_max`; shapes as in `intersect`, bool `[*batch]`."""
     batch, rays = _flatten(caster, origin, direction, t_max)
     if caster is None or 0 in batch:
         return (np if isinstance(caster, EmbreeCaster) else jnp).zeros(batch, bool)
     cast = embree.occluded if isinstance(caster, EmbreeCaster) else brute_force.occluded
     return cast(caster, *rays).reshape(batch)
+
+
+def crossings(caster: Caster, origin, direction, t_max, *, max_hits: int) -> Crossings:
+    """Where rays `[n, 3]`, `[n, 3]`, `[n]` enter and leave the closed mesh of `caster`, in turn, up to `t_max`.
+
+    How, and what is repaired: see `closed_meshes`. Of no mesh, nothing is inside. `max_hits` per ray is kept.
+    """
+    (n,), rays = _flatten(caster, origin, direction, t_max)
+    if caster is None or n == 0:
+        xp = np if isinstance(caster, EmbreeCaster) else jnp
+        t, face = xp.full((n, max_hits), np.inf, np.float32), xp.full((n, max_hits), -1, np.int32)
+        return Crossings(t, face, xp.zeros(n, bool), xp.zeros((), np.int32))
+    return closed_meshes.crossings(intersect, caster, *rays, max_hits=max_hits)
+
+
+def all_intersections(caster: Caster, origin, direction, t_max, *, max_hits: int):
+    """`crossings` as (t [n, max_hits] increasing, inf where no more, face, number of rays with more than that)."""
+    found = crossings(caster, origin, direction, t_max, max_hits=max_hits)
+    return found.t, found.face, found.num_overflows
 
 
 def _flatten(caster, origin, direction, t_max):

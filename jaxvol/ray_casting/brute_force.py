@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvol.ray_casting.triangles import coordinates, distance_to_face, in_blocks, triangle_test
+from jaxvol.ray_casting.triangles import coordinates, distance_to_face, in_blocks, ray_frame, triangle_test
 
 _BLOCK = 4096  # lanes: their state stays in a core's cache while the triangles go by
 
@@ -44,11 +44,11 @@ def intersect(
     triangles = lax.stop_gradient(caster.triangles)
 
     def block(origin, direction, t_max):
-        o, d = coordinates(origin), coordinates(direction)
+        o, frame = coordinates(origin), ray_frame(direction)
 
         def step(state, index, corners):
             t_best, face = state
-            closer, t = triangle_test(corners, o, d, t_best)
+            closer, t = triangle_test(corners, o, frame, t_best)
             return jnp.where(closer, t, t_best), jnp.where(closer, index, face)
 
         return (_scan_triangles(step, triangles, (t_max, jnp.full(t_max.shape, -1, jnp.int32)))[1],)
@@ -65,10 +65,10 @@ def occluded(
     """Whether anything lies between the origin and t_max."""
 
     def block(origin, direction, t_max):
-        o, d = coordinates(origin), coordinates(direction)
+        o, frame = coordinates(origin), ray_frame(direction)
 
         def step(blocked, _, corners):
-            return blocked | triangle_test(corners, o, d, t_max)[0]
+            return blocked | triangle_test(corners, o, frame, t_max)[0]
 
         return (_scan_triangles(step, caster.triangles, jnp.zeros(t_max.shape, bool)),)
 

@@ -18,8 +18,9 @@ _MIN_LANES_PER_THREAD = 4096  # below this a second thread costs more than it br
 class EmbreeCaster:
     """An Embree scene (robust mode: watertight at shared edges) and the mesh's normals. Not a pytree."""
 
-    def __init__(self, vertices, faces, normals: np.ndarray, num_bodies: int, *, num_threads: int | None = None):
+    def __init__(self, vertices, faces, triangles, normals, num_bodies: int, *, num_threads: int | None = None):
         self.scene = EmbreeScene(robust=True)
+        self.triangles = triangles  # [F, 3, 3]
         self.normals = normals  # [F, 3], outward for a closed mesh
         self.num_bodies = num_bodies  # connected components of the mesh
         self.num_threads = num_threads or _num_cores()

@@ -1,8 +1,10 @@
 """The ray and triangle test that the brute-force and BVH casters share, and the distance to a known face.
 
-The test is the Pluecker form of Embree's robust mode: an edge shared by two triangles gives exactly opposite values
-in both (built from the difference and the sum of its end points relative to the ray's origin, which change sign or
-stay under a swap of the ends), so that no ray slips between the two.
+Watertight after Woop, Benthin, Wald 2013 (Watertight Ray/Triangle Intersection, JCGT 2): corners are projected along
+the ray onto a plane across it, where the ray is the origin. A corner's projection does not depend on the triangle it
+is seen from, so that neighbours agree on their common edges and vertices, and no ray slips between them. Here the
+plane is spanned by an orthonormal frame instead of a shear, and a tolerance of one rounding of the products stands for
+their fallback to double precision (compilers contract `a b - c d` to one rounding in ways that differ by triangle).
 """
 
 import jax.numpy as jnp
@@ -12,32 +14,48 @@ from jaxtyping import Array, Float, Int
 _ULP = 1.2e-7  # float32
 
 
-def _edge(start, end, d):
-    """Signed volume of the edge (relative to the ray's origin) and the direction."""
-    ex, ey, ez = end[0] - start[0], end[1] - start[1], end[2] - start[2]
-    sx, sy, sz = end[0] + start[0], end[1] + start[1], end[2] + start[2]
-    return d[0] * (ey * sz - ez * sy) + d[1] * (ez * sx - ex * sz) + d[2] * (ex * sy - ey * sx)
+def ray_frame(direction: Float[Array, "n 3"]) -> tuple:
+    """((x, y, z) of s, of t, of d): s and t orthonormal across the rays (Duff et al. 2017), d their directions."""
+    d = coordinates(direction)
+    size = jnp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    x, y, z = (c / jnp.where(size > 0.0, size, 1.0) for c in d)
+    sign = jnp.where(z < 0.0, -1.0, 1.0)
+    p = -1.0 / (sign + z)
+    q = x * y * p
+    return (1.0 + sign * x * x * p, sign * q, -sign * x), (q, sign + y * y * p, -y), d
 
 
-def triangle_test(corners, o, d, t_best):
+def _side(p, q):
+    """Twice the signed area of the origin and two points of the plane, and its rounding error."""
+    left, right = p[0] * q[1], p[1] * q[0]
+    return left - right, _ULP * (jnp.abs(left) + jnp.abs(right))
+
+
+def triangle_test(corners, o, frame, t_best):
     """Whether rays meet triangles nearer than `t_best`, and where. Any shapes that broadcast, one array per coordinate.
 
-    `corners` = ((x, y, z) of v0, of v1, of v2), `o`, `d` = (x, y, z). Returns (closer, t); t is a filler if not closer.
+    `corners` = ((x, y, z) of v0, of v1, of v2), `o` = (x, y, z), `frame` from `ray_frame`. Returns (closer, t); t is a
+    filler if not closer.
     """
-    a, b, c = (tuple(v[i] - o[i] for i in range(3)) for v in corners)
-    u, v, w = _edge(a, b, d), _edge(b, c, d), _edge(c, a, d)
-    tolerance = _ULP * jnp.abs(u + v + w)
-    lowest, highest = jnp.minimum(u, jnp.minimum(v, w)), jnp.maximum(u, jnp.maximum(v, w))
-    inside = (lowest >= -tolerance) | (highest <= tolerance)
-    # Edges from the corners themselves: exact for axis-aligned faces, unlike corners relative to a far origin.
+    relative = [tuple(v[i] - o[i] for i in range(3)) for v in corners]
+    s, t, d = frame
+    a, b, c = (tuple(f[0] * v[0] + f[1] * v[1] + f[2] * v[2] for f in (s, t)) for v in relative)
+    (u, u_error), (v, v_error), (w, w_error) = _side(b, c), _side(c, a), _side(a, b)
+    front = (u >= -u_error) & (v >= -v_error) & (w >= -w_error)
+    back = (u <= u_error) & (v <= v_error) & (w <= w_error)
+    n = _normal(corners)
+    facing = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+    height = n[0] * relative[0][0] + n[1] * relative[0][1] + n[2] * relative[0][2]
+    distance = height / jnp.where(facing == 0.0, 1.0, facing)
+    return (front | back) & (facing != 0.0) & (distance > 0.0) & (distance < t_best), distance
+
+
+def _normal(corners):
+    """Cross product of two edges, from the corners themselves: exact for axis-aligned faces however far the ray."""
     p, q, r = corners
     e = tuple(q[i] - p[i] for i in range(3))
     f = tuple(r[i] - p[i] for i in range(3))
-    n = (e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0])
-    facing = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
-    height = n[0] * a[0] + n[1] * a[1] + n[2] * a[2]
-    t = height / jnp.where(facing == 0.0, 1.0, facing)
-    return inside & (facing != 0.0) & (t > 0.0) & (t < t_best), t
+    return e[1] * f[2] - e[2] * f[1], e[2] * f[0] - e[0] * f[2], e[0] * f[1] - e[1] * f[0]
 
 
 def distance_to_face(
@@ -73,4 +91,3 @@ def in_blocks(function, block: int, *lanes: Array):
 def coordinates(vectors: Float[Array, "n 3"]) -> tuple[Array, Array, Array]:
     """One array per coordinate."""
     return vectors[:, 0], vectors[:, 1], vectors[:, 2]
-
