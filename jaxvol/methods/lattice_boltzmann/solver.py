@@ -1,0 +1,86 @@
+"""The steady state of the lattice: phi = B (k phi + b), solved by preconditioned conjugate gradients.
+
+u = sqrt(k) phi makes it symmetric positive definite, (I - sqrt(k) B sqrt(k)) u = sqrt(k) B b, for every lattice of
+lattice.py. Gradients come from the same solve with the transposed right side (implicit differentiation by lineax), never
+from the unrolled iteration. The number of applications of B does not depend on the resolution; plain iteration
+(stepping.py) needs as many steps as light needs to cross the grid, times the scattering orders.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxvol.methods.lattice_boltzmann import preconditioner
+from jaxvol.methods.lattice_boltzmann.krylov import ConjugateGradients
+from jaxvol.methods.lattice_boltzmann.lattice import Coefficients, Lattice
+from jaxvol.methods.lattice_boltzmann.sweeps import transport
+
+
+class Solution(NamedTuple):
+    """phi = fluence * h^2 [W], per voxel; its parts by scattering order; how the solve went."""
+
+    phi_first: Float[Array, "X Y Z"]  # B b: light that scattered once in the medium and arrives (sources: b)
+    phi: Float[Array, "X Y Z"]  # all scattered light
+    num_applications: Int[Array, ""]  # of B, all counted
+    residual: Float[Array, ""]  # |u - sqrt(k) B (sqrt(k) u + b)| / |sqrt(k) B b|
+    converged: Bool[Array, ""]
+
+
+def solve(
+    lattice: Lattice,
+    coefficients: Coefficients,
+    deposit: Float[Array, "X Y Z"],
+    *,
+    tolerance: float = 1e-4,
+    max_steps: int = 100,
+    levels: tuple[preconditioner.Level, ...] | None = None,
+) -> Solution:
+    """Solve for the scattered light that `deposit` (W scattered per voxel out of the marched light, isotropic) makes.
+
+    `levels` from `preconditioner.build`; None = plain conjugate gradients. `tolerance` is of the residual of u, relative.
+    """
+    root = _safe_sqrt(coefficients.scattering)
+    phi_first = transport(lattice, coefficients, deposit)
+    right = root * phi_first
+    size = jnp.sqrt(jnp.sum(right * right))
+    scale = jnp.where(size > 0, size, 1.0)
+
+    def operator(u):
+        return u - root * transport(lattice, coefficients, root * u)
+
+    def precondition(r):
+        if levels is None:
+            return r
+        inside = root if coefficients.wall is None else jnp.where(coefficients.wall, 0.0, root)
+        return r + inside * preconditioner.v_cycle(levels, inside * r)
+
+    structure = jax.eval_shape(lambda: right)
+    symmetric = lx.positive_semidefinite_tag
+    answer = lx.linear_solve(
+        lx.FunctionLinearOperator(operator, structure, symmetric),
+        right,
+        ConjugateGradients(tolerance=tolerance, max_steps=max_steps),
+        options={
+            "preconditioner": lx.FunctionLinearOperator(precondition, structure, symmetric),
+            "y0": jax.lax.stop_gradient(precondition(right)),
+        },
+        throw=False,
+    )
+    u = answer.value
+    phi = transport(lattice, coefficients, root * u + deposit)
+    residual = jnp.sqrt(jnp.sum((u - root * phi) ** 2)) / scale
+    return Solution(
+        phi_first=phi_first,
+        phi=phi,
+        num_applications=answer.stats["num_steps"] + 3,  # B b, the residual of the first guess, the final phi
+        residual=residual,
+        converged=residual <= 2.0 * tolerance,
+    )
+
+
+def _safe_sqrt(k):
+    positive = k > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, k, 1.0)), 0.0)
