@@ -21,7 +21,7 @@ COMMANDS = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(*, arguments: Sequence[str] | None = None) -> None:
     """Run the command line; ends the process with the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     command = typer.main.get_command(_assemble(arguments))

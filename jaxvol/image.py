@@ -7,12 +7,15 @@ JSON string of metadata (ARCHITECTURE section 3). Values are linear RGB radiance
 
 import importlib
 import importlib.util
+import io
 import json
+import mmap
 import os
+import struct
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -83,11 +86,29 @@ def write_exr(
         "type": OpenEXR.scanlineimage,
         METADATA: jobs.config_json(dict(metadata or {})),
     }
-    with jobs.atomic_write(path) as temporary, _captured_stderr() as printed:
+    with jobs.atomic_write(path) as temporary, _captured() as printed:
         try:
             OpenEXR.File(header, arrays).write(os.fspath(temporary))
         except RuntimeError as error:
             raise OSError(f"{path}: cannot be written ({_cause(error, printed(), temporary)})") from error
+        _check_complete(path, temporary, height=shape[0])
+
+
+def _check_complete(path: str | os.PathLike, written: Path, *, height: int) -> None:
+    """Raise OSError unless the last chunk ends where the file ends: OpenEXR ignores a disk that fills at the last flush."""
+    num_chunks = -(-height // 16)  # ZIP packs 16 rows
+    try:
+        with open(written, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            position = 8
+            while data[position]:  # attributes: name, type, length, value
+                position = data.find(b"\0", data.find(b"\0", position) + 1) + 1
+                position += 4 + struct.unpack_from("<I", data, position)[0]
+            (last,) = struct.unpack_from("<Q", data, position + 1 + 8 * (num_chunks - 1))
+            end = last + 8 + struct.unpack_from("<I", data, last + 4)[0]
+    except (IndexError, ValueError, struct.error):
+        end = -1
+    if end != os.path.getsize(written):
+        raise OSError(f"{path}: cannot be written (No space left on device, or the file would be too large)")
 
 
 def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -101,7 +122,7 @@ def read_exr(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, 
         magic, num_bytes = file.read(4), os.fstat(file.fileno()).st_size
     if magic != b"\x76\x2f\x31\x01":
         raise ValueError(f"{path}: is not an OpenEXR file")
-    with _captured_stderr() as printed:
+    with _captured() as printed:
         try:
             with OpenEXR.File(os.fspath(path), header_only=True) as file:
                 num_parts, header = len(file.parts), dict(file.header())
@@ -134,11 +155,14 @@ def _check_size(path: Path, header: dict[str, Any], num_parts: int, num_bytes: i
 
 
 @contextmanager
-def _captured_stderr() -> Iterator[Any]:
-    """OpenEXR prints the cause of an error to the process's stderr; yields a function that returns what was printed."""
+def _captured() -> Iterator[Any]:
+    """OpenEXR prints the cause of an error to the process's stderr and a warning to Python's stdout, which may be JSON.
+
+    Yields a function that returns what stderr got.
+    """
     sys.stderr.flush()
     kept = os.dup(2)
-    with tempfile.TemporaryFile() as file:
+    with tempfile.TemporaryFile() as file, redirect_stdout(io.StringIO()):
         os.dup2(file.fileno(), 2)
 
         def printed() -> str:

@@ -2,7 +2,7 @@
 
 A method is a module with `claims(scene)`, `plan(scene, camera, *, ...)` and `render(scene, camera, plan, *, seed, ...)`.
 Which keyword arguments it takes is read off `plan` and `render`. Two of them are offered to every method that names them:
-`progress(done, total)` is called as work gets done, `on_stage(name)` after each stage, for the table of stage times.
+`on_progress(share)` is called as work gets done, `on_stage(name)` after each stage, for the table of stage times.
 """
 
 import importlib
@@ -26,8 +26,9 @@ from jaxvol.scene import SceneFile
 from jaxvol.scene_config import nearest
 from jaxvol.types import Estimate, Scene
 
-OFFERED = ("seed", "progress", "on_stage")  # what the caller of `render_scene` provides, never a scene file
+OFFERED = ("seed", "on_progress", "on_stage")  # what the caller of `render_scene` provides, never a scene file
 SAMPLES = ("samples", "num_samples")  # both names that methods give to samples per pixel
+NEVER = 2**30  # a number of scatterings that no path reaches
 COMPILING = "/jax/core/compile/"
 
 
@@ -60,8 +61,11 @@ def method_arguments(module: ModuleType, name: str, file: SceneFile) -> tuple[di
     Raises ValueError for a key that the method does not have, or a value of the wrong type.
     """
     own = dict(file.render.options.get(name, {}))
-    shared = {key: getattr(file.render, key) for key in ("max_scatterings", "russian_roulette")}
-    shared |= dict.fromkeys(SAMPLES, file.render.samples)
+    shared = dict.fromkeys(SAMPLES, file.render.samples)
+    if file.render.max_scatterings is not None:
+        shared["max_scatterings"] = file.render.max_scatterings
+    if not file.render.russian_roulette:
+        shared["roulette_from"] = NEVER
     chosen, known = ({}, {}), {}
     for keywords, function in zip(chosen, (module.plan, module.render), strict=True):
         for key, parameter in inspect.signature(function).parameters.items():
@@ -88,10 +92,10 @@ def _typed(key: str, value: Any, annotation: Any) -> Any:
         raise ValueError(f"{key} = {value!r} must be {expected}") from error
 
 
-Progress = Callable[[float, float], None]
+Progress = Callable[[float], None]
 
 
-def render_scene(file: SceneFile, *, method: str | None = None, progress: Progress | None = None) -> Rendering:
+def render_scene(file: SceneFile, *, method: str | None = None, on_progress: Progress | None = None) -> Rendering:
     """Plan and render the scene with one method, timed. Raises ValueError for what the method refuses."""
     name = file.render.method if method is None else method
     if file.camera is None:
@@ -113,7 +117,7 @@ def render_scene(file: SceneFile, *, method: str | None = None, progress: Progre
             stages[stage] = stages.get(stage, 0.0) + now - last[0]
             last[0] = now
 
-        offered = {"seed": file.render.seed, "progress": progress, "on_stage": on_stage}
+        offered = {"seed": file.render.seed, "on_progress": on_progress, "on_stage": on_stage}
         taken = inspect.signature(module.render).parameters
         offered = {key: value for key, value in offered.items() if key in taken and value is not None}
         estimate = module.render(file.scene, file.camera, plan, **render_arguments, **offered)

@@ -11,8 +11,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Compiled programs are kept between runs of the suite; deleting .pytest_cache forgets them.
-jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "jax"))
+# Compiled programs are kept between runs of the suite; deleting .pytest_cache forgets them. The environment variable
+# keeps the command line, which tests call in this process and in others, from choosing a folder of its own.
+CACHE = str(ROOT / ".pytest_cache" / "jax")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
+jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 

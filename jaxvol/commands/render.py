@@ -39,17 +39,16 @@ def render(
             print(line)
 
     name = file.render.method
-    with jobs.progress(f"{file.name}, {name}", total=1.0) as advance:
+    with jobs.progress(f"{file.name}, {name}", total=100) as advance:
         done = 0.0
 
-        def progress(part: float, whole: float) -> None:
+        def on_progress(share: float) -> None:
             nonlocal done
-            share = min(part / whole, 1.0)
-            advance(share - done)
-            done = share
+            advance(100 * max(min(share, 1.0) - done, 0.0))
+            done = max(done, min(share, 1.0))
 
-        result = rendering.render_scene(file, progress=progress)
-        advance(1.0 - done)
+        result = rendering.render_scene(file, on_progress=on_progress)
+        advance(100 * (1.0 - done))
     if explain:
         _explain(result)
     _write(file, result, out)
