@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxvol.fast_math import atan_nonnegative, sin_cos
+from jaxvol.fast_math import atan_unit, sin_cos
 
 Vector = tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]
 
@@ -49,7 +49,7 @@ def angle_between(a: Float[Array, "*n"], b: Float[Array, "*n"], h: Float[Array, 
     numerator = h * (b - a)
     denominator = h * h + a * b
     size = jnp.abs(denominator)
-    y = atan_nonnegative(jnp.minimum(numerator, size) / jnp.maximum(jnp.maximum(numerator, size), 1e-30))
+    y = atan_unit(jnp.minimum(numerator, size) / jnp.maximum(jnp.maximum(numerator, size), 1e-30))
     y = jnp.where(numerator > size, 0.5 * math.pi - y, y)
     return jnp.where(denominator < 0, math.pi - y, y)
 
@@ -79,7 +79,7 @@ def sample_along_ray(
     angle = angle_between(a, b, s)
     cos_shifted, sin_shifted = _turned(u * angle)
     # t = s tan(atan(a / s) + u angle), without the arctangent of a.
-    t = s * (a * cos_shifted + s * sin_shifted) / _away_from_zero(s * cos_shifted - a * sin_shifted)
+    t = s * (a * cos_shifted + s * sin_shifted) / jnp.maximum(s * cos_shifted - a * sin_shifted, 1e-30)
     t = jnp.clip(t, a, b)
     weight = angle * inverse * (t * t + s2) * inverse_square(h2 + t * t, clamp)
     return t, weight
@@ -103,10 +103,6 @@ def _turned(phi):
     """(cos, sin) of phi in [0, pi] through the polynomial that holds within a quarter turn of zero."""
     sin_x, cos_x = sin_cos(phi - 0.5 * math.pi)
     return -sin_x, cos_x
-
-
-def _away_from_zero(x):
-    return jnp.where(jnp.abs(x) < 1e-30, 1e-30, x)
 
 
 def closest(origin: Vector, direction: Vector, point: Vector) -> tuple[Float[Array, "*n"], Vector, Float[Array, "*n"]]:

@@ -1,0 +1,251 @@
+"""Bias compensation: the energy that clamping removed, from new path vertices within the clamp distance (4.3, 4.4).
+
+min(1/r^2, b) + max(1/r^2 - b, 0) = 1/r^2. The second part is sampled the other way round: from x a direction by the
+phase function or BRDF and a distance t < d = 1/sqrt(b), which makes a vertex x' with weight max(0, 1 - t^2/d^2); its
+light is the lights' light (virtual AND primary: a path light-x'-x-eye is clamped like any other, which the paper
+forgets) plus the same residual again.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxvol import lights as primary
+from jaxvol import materials, media, phase, ray_casting, sampling
+from jaxvol.methods.instant_multiple_scattering import gathering, pairs, receivers
+from jaxvol.methods.instant_multiple_scattering.receivers import Points
+from jaxvol.types import Hits, Medium, Scene
+
+_MEAN_WEIGHT = 2.0 / 3.0  # integral of 1 - q^2 over q in (0, 1)
+
+
+def sample_distance(u: Float[Array, "*n"], d: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """t in (0, d) with pdf 1.5 (1 - t^2/d^2) / d: the compensation weight itself, which then cancels."""
+    return 2.0 * d * jnp.sin(jnp.arcsin(u) * (1.0 / 3.0))
+
+
+def sample_distance_pdf(t: Float[Array, "*n"], d: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """1.5 (1 - t^2/d^2) / d inside (0, d), else 0."""
+    q = t / d
+    return jnp.where((t >= 0) & (t <= d), 1.5 * (1.0 - q * q) / d, 0.0)
+
+
+def distance_cdf(t: Float[Array, "*n"], d: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Integral of `sample_distance_pdf` from 0 to t."""
+    q = jnp.clip(t / d, 0.0, 1.0)
+    return q * (1.5 - 0.5 * q * q)
+
+
+def weight(t: Float[Array, "*n"], d: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """max(0, (G - b) / G) = max(0, 1 - t^2/d^2)."""
+    q = t / d
+    return jnp.maximum(1.0 - q * q, 0.0)
+
+
+def sample_distance_exponential(
+    u: Float[Array, "*n"], d: Float[Array, "*n"], sigma: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """The paper's t = -log(1 - u (1 - exp(-sigma d))) / sigma, in forms that hold for sigma -> 0."""
+    return sampling.sample_truncated_exponential(u, sigma, d)
+
+
+def sample_distance_exponential_pdf(
+    t: Float[Array, "*n"], d: Float[Array, "*n"], sigma: Float[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """sigma exp(-sigma t) / (1 - exp(-sigma d))."""
+    return sampling.sample_truncated_exponential_pdf(t, sigma, d)
+
+
+class Proposal(NamedTuple):
+    """Where the residual of each point looks for a new vertex."""
+
+    origin: Float[Array, "n 3"]  # off the surface where the point is on one
+    direction: Float[Array, "n 3"]  # away from the point
+    gain: Float[Array, "n 3"]  # f_hat / p(direction): sigma_s in the medium, f_r cos / p on a surface
+
+
+@jax.jit
+def propose(
+    scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array, "n"], u3: Float[Array, "n"]
+) -> Proposal:
+    """A direction for the residual of each point, by the phase function or the BRDF."""
+    backwards = -points.outgoing
+    direction, gain, origin = backwards, points.scattering, points.position
+    if scene.medium is not None:
+        arriving, _ = phase.sample(scene.medium, points.outgoing, u1, u2)
+        direction = -arriving
+    if points.on_surface is not None:
+        surface = points.surface
+        leaving = materials.sample(surface, points.normal, backwards, u1, u2, u3)
+        pdf = materials.sample_pdf(surface, points.normal, backwards, leaving)
+        value = materials.evaluate(surface, points.normal, backwards, leaving)
+        cosine = jnp.abs(sampling.dot(points.normal, leaving))
+        reflected = value * (cosine / jnp.maximum(pdf, 1e-20))[:, None]
+        on = points.on_surface[:, None]
+        direction = jnp.where(on, leaving, direction)
+        gain = jnp.where(on, reflected, gain)
+        scale = ray_casting.scene_scale(scene.mesh)
+        origin = jnp.where(on, ray_casting.offset_origin(points.position, points.normal, direction, scale=scale), origin)
+    return Proposal(origin, direction, gain)
+
+
+@partial(jax.jit, static_argnames=("distance", "transmittance", "num_steps"))
+def new_vertices(
+    scene: Scene,
+    points: Points,
+    proposal: Proposal,
+    s: Float[Array, "n"],
+    face: Int[Array, "n"],
+    u: Float[Array, "n"],
+    u_kind: Float[Array, "n"],
+    sigma: Float[Array, "n"],
+    *,
+    distance: str,
+    transmittance: str,
+    num_steps: int,
+) -> tuple[Points, Float[Array, "n 3"]]:
+    """The new vertices x' and what carries their light to the points: gain tau(x, x') max(0, 1 - t^2/d^2) / p(t).
+
+    (s, face) is the surface that the ray meets within the clamp distance (inf, -1: none); it becomes the vertex with
+    probability 1 - F(s)/2, else one in the medium before it. `sigma` is the local mean extinction: for the paper's
+    distance="exponential" and, with transmittance="local", in place of the true one (biased).
+    """
+    d = points.clamp
+    medium = scene.medium
+    meets = jnp.asarray(face) >= 0
+    reach = jnp.where(meets, distance_cdf(s, d), 1.0)
+    to_surface = jnp.where(meets, 1.0 - 0.5 * reach, 0.0)
+    if medium is None:
+        to_surface = jnp.where(meets, 1.0, 0.0)
+    on_surface = u_kind < to_surface
+    if distance == "weight":
+        t = sample_distance(u * reach, d)
+        factor = reach * (_MEAN_WEIGHT * d)
+    else:
+        limit = jnp.minimum(jnp.asarray(s), d)
+        t = sample_distance_exponential(u, limit, sigma)
+        factor = weight(t, d) / sample_distance_exponential_pdf(t, limit, sigma)
+    factor = factor / jnp.maximum(1.0 - to_surface, 1e-6)
+    s_safe = jnp.where(meets, jnp.asarray(s), 0.0)
+    t = jnp.where(on_surface, s_safe, t)
+    factor = jnp.where(on_surface, weight(t, d) / jnp.maximum(to_surface, 1e-6), factor)
+    position = proposal.origin + t[:, None] * proposal.direction
+    throughput = proposal.gain * factor[:, None]
+    scattering = jnp.zeros_like(throughput)
+    if medium is not None:
+        scattering = media.density(medium, position)[:, None] * medium.sigma_s
+        if transmittance == "local":
+            depth = (sigma * t)[:, None] * _relative(medium)
+        else:
+            column = receivers.column_between(medium, proposal.origin, position, num_steps=num_steps)
+            depth = column[:, None] * media.sigma_t(medium)
+        throughput = throughput * jnp.exp(-depth)
+    outgoing = -proposal.direction
+    if points.on_surface is None:
+        return Points(position, outgoing, scattering, d), throughput
+    hit: Hits = ray_casting.hits(scene.mesh, proposal.origin, proposal.direction, jnp.where(meets, s, jnp.inf), face)
+    on = on_surface[:, None]
+    found = Points(
+        jnp.where(on, hit.position, position),
+        outgoing,
+        jnp.where(on, 0.0, scattering),
+        d,
+        on_surface,
+        hit.normal,
+        materials.surface_at(scene.mesh, face),
+    )
+    return found, throughput
+
+
+def _relative(medium):
+    """Extinction of the channels relative to their mean."""
+    extinction = media.sigma_t(medium)
+    return extinction / jnp.maximum(jnp.mean(extinction), 1e-30)
+
+
+@jax.jit
+def sample_primary(
+    scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array, "n"], u3: Float[Array, "n"]
+) -> tuple[primary.LightSample, Float[Array, "n 3"]]:
+    """One direction towards a primary light for each point, and the origin of its shadow ray."""
+    found = primary.sample_light(scene, points.position, u1, u2, u3)
+    origin = points.position
+    if points.on_surface is not None:
+        lifted = ray_casting.offset_origin(
+            points.position, points.normal, found.direction, scale=ray_casting.scene_scale(scene.mesh)
+        )
+        origin = jnp.where(points.on_surface[:, None], lifted, origin)
+    return found, origin
+
+
+@partial(jax.jit, static_argnames=("isotropic", "num_steps"))
+def direct_light(
+    scene: Scene,
+    points: Points,
+    sample: primary.LightSample,
+    visible: Bool[Array, "n"] | None,
+    *,
+    isotropic: bool,
+    num_steps: int,
+) -> Float[Array, "n 3"]:
+    """Light of the primary lights scattered at the points towards `outgoing`: one sample each, f tau V L / p."""
+    towards = tuple(-x for x in pairs.components(sample.direction))
+    received = jnp.stack(gathering.scattered(points, towards, scene.medium, isotropic=isotropic), axis=-1)
+    value = received * sample.radiance / jnp.maximum(sample.pdf, 1e-30)[:, None]
+    if visible is not None:
+        value = jnp.where(visible[:, None], value, 0.0)
+    if scene.medium is not None:
+        column = receivers.column_between(
+            scene.medium, points.position, _end(points.position, sample), num_steps=num_steps
+        )
+        value = value * jnp.exp(-column[:, None] * media.sigma_t(scene.medium))
+    return value
+
+
+def _end(position, sample):
+    """The light's position, or for an infinite one a point that is surely outside the medium."""
+    far = jnp.where(jnp.isfinite(sample.distance), sample.distance, 1e6)
+    return position + far[:, None] * sample.direction
+
+
+def local_sigma(medium: Medium | None, mip: Float[Array, "x y z"] | None, position: Float[Array, "n 3"]) -> Float[Array, "n"]:
+    """Mean extinction around points: of the channels, times the density of a coarse grid (the paper's average)."""
+    if medium is None:
+        return jnp.zeros(position.shape[:-1], jnp.float32)
+    sigma = jnp.mean(media.sigma_t(medium))
+    if mip is None:
+        return jnp.broadcast_to(sigma, position.shape[:-1])
+    shape = jnp.asarray(mip.shape)
+    cell = media.voxel_coordinates(medium.bounds, mip.shape, position)
+    cell = jnp.clip(cell.astype(jnp.int32), 0, shape - 1)
+    flat = (cell[..., 0] * mip.shape[1] + cell[..., 1]) * mip.shape[2] + cell[..., 2]
+    return sigma * mip.reshape(-1)[flat]
+
+
+def coarse_density(density: Float[Array, "X Y Z"], *, block: int) -> np.ndarray:
+    """Mean density of blocks of voxels, smoothed over the neighbours; eager. Its cells are `block` voxels wide (at least)."""
+    grid = np.asarray(density, np.float64)
+    shape = [max(n // block, 1) for n in grid.shape]
+    for axis, count in enumerate(shape):
+        parts = np.array_split(grid, count, axis=axis)
+        grid = np.stack([part.mean(axis=axis) for part in parts], axis=axis)
+    padded = np.pad(grid, 1, mode="edge")
+    for axis in range(3):
+        n = padded.shape[axis]
+        low, mid, high = (np.take(padded, range(k, n - 2 + k), axis=axis) for k in range(3))
+        padded = 0.25 * low + 0.5 * mid + 0.25 * high
+    return padded.astype(np.float32)
+
+
+def clamp_distance(sigma: Float[Array, "*n"], *, mean_free_paths: float, most: float) -> Float[Array, "*n"]:
+    """d = mean_free_paths / sigma, at most `most` (a length)."""
+    return jnp.minimum(mean_free_paths / jnp.maximum(sigma, 1e-12), most)
+
+
+def rises(sigma: Float[Array, "n"], gradient: Float[Array, "n"], d: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Change of extinction over the clamp distance relative to its local mean: above about 1 the "local" mode is off."""
+    return gradient * d / jnp.maximum(sigma, 1e-12)

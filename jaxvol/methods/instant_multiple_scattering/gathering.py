@@ -1,0 +1,216 @@
+"""Light of every virtual light at every receiver, where a pair is cheap: homogeneous medium, nothing that occludes.
+
+Receivers lie along the lanes, a scan runs over the lights (section 4.2; specification 2 and 5). An eye ray meets each
+light at one point of its own, chosen by softened equi-angular sampling, or, as the paper does, at stratified points.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxvol import media, phase
+from jaxvol.methods.instant_multiple_scattering import pairs
+from jaxvol.methods.instant_multiple_scattering.pairs import Vector
+from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
+from jaxvol.types import Medium
+
+_UNROLL = 4
+_INV_4PI = 0.07957747154594767
+
+
+class Light(NamedTuple):
+    """One virtual light, or one per lane; see `VirtualLights`."""
+
+    position: Vector
+    direction: Vector
+    strength: Vector
+    normal: Vector | None
+    specular: Vector | None
+    exponent: Float[Array, "*n"] | None
+
+
+def rows(lights: VirtualLights) -> Light:
+    """The lights as component arrays [M], to scan over."""
+    vector = lambda v: None if v is None else pairs.components(v)  # noqa: E731
+    return Light(
+        pairs.components(lights.position),
+        pairs.components(lights.direction),
+        pairs.components(lights.strength),
+        vector(lights.normal),
+        vector(lights.specular),
+        lights.exponent,
+    )
+
+
+def phase_value(medium: Medium, cos_theta: Float[Array, "*n"], *, isotropic: bool) -> Float[Array, "*n"] | float:
+    """The phase function, 1/sr; `isotropic` promises g = 0."""
+    if isotropic:
+        return _INV_4PI
+    if medium.phase is not None:
+        return phase.evaluate_table(medium.phase, cos_theta)
+    return pairs.henyey_greenstein(cos_theta, medium.g)
+
+
+def lobe(exponent: Float[Array, "*n"], cos_theta: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """max(cos, 0)^exponent as an exponential; 0 at cos <= 0."""
+    safe = jnp.clip(cos_theta, 1e-30, 1.0)
+    return jnp.where(cos_theta > 0, jnp.exp(exponent * jnp.log(safe)), 0.0)
+
+
+def leaving(light: Light, w: Vector, medium: Medium | None, *, isotropic: bool) -> Vector:
+    """Radiance weight times emitter cosine that a light sends along the unit direction w, RGB."""
+    if light.normal is None:
+        f = phase_value(medium, pairs.dot(light.direction, w), isotropic=isotropic)
+        return tuple(s * f for s in light.strength)
+    cosine = jnp.maximum(pairs.dot(light.normal, w), 0.0)
+    if light.specular is None:
+        return tuple(s * cosine for s in light.strength)
+    glossy = lobe(light.exponent, pairs.dot(light.direction, w))
+    return tuple((s + k * glossy) * cosine for s, k in zip(light.strength, light.specular, strict=True))
+
+
+def scattered(points: Points, towards: Vector, medium: Medium | None, *, isotropic: bool) -> Vector:
+    """sigma_s f_p, or f_r cos, at the points for light that travels along `towards`, RGB (cosine included)."""
+    outgoing = pairs.components(points.outgoing)
+    if medium is None:
+        value = (0.0, 0.0, 0.0)
+    else:
+        f = phase_value(medium, pairs.dot(towards, outgoing), isotropic=isotropic)
+        value = tuple(s * f for s in pairs.components(points.scattering))
+    if points.on_surface is None:
+        return value
+    normal = pairs.components(points.normal)
+    side = jnp.where(pairs.dot(normal, outgoing) >= 0, 1.0, -1.0)
+    cos_in = -pairs.dot(normal, towards)
+    lit = cos_in * side > 0
+    albedo = pairs.components(points.surface.albedo)
+    brdf = tuple(a * (4.0 * _INV_4PI) for a in albedo)
+    if points.surface.specular is not None:
+        mirrored = pairs.combine(towards, 2.0 * cos_in, normal)
+        scale = (points.surface.exponent + 2.0) * (2.0 * _INV_4PI)
+        glossy = scale * lobe(points.surface.exponent, pairs.dot(mirrored, outgoing))
+        brdf = tuple(f + s * glossy for f, s in zip(brdf, pairs.components(points.surface.specular), strict=True))
+    cosine = jnp.where(lit, jnp.abs(cos_in), 0.0)
+    return tuple(jnp.where(points.on_surface, f * cosine, v) for f, v in zip(brdf, value, strict=True))
+
+
+def extinguish(value: Vector, sigma_t: Vector, column: Float[Array, "*n"], *, grey: bool) -> Vector:
+    """value * exp(-sigma_t column) per channel; one exponential when `grey`."""
+    if grey:
+        tau = jnp.exp(-sigma_t[0] * column)
+        return tuple(v * tau for v in value)
+    return tuple(v * jnp.exp(-s * column) for v, s in zip(value, sigma_t, strict=True))
+
+
+class RayPoint(NamedTuple):
+    """A point of an eye ray chosen for one light."""
+
+    t: Float[Array, "n"]
+    weight: Float[Array, "n"]  # min(1/r^2, 1/clamp^2) / pdf
+    distance: Float[Array, "n"]  # to the light
+    towards: Vector  # unit, from the light to the point
+
+
+def choose_point(
+    origin: Vector, direction: Vector, segments: Segments, position: Vector, u: Float[Array, "n"], *, stratified: bool
+) -> RayPoint:
+    """One point of each eye ray for a light at `position`; `stratified` spreads u evenly instead (the paper)."""
+    t_closest, perpendicular, h2 = pairs.closest(origin, direction, position)
+    a, b = segments.t0 - t_closest, segments.t1 - t_closest
+    if stratified:
+        t = a + u * (b - a)
+        weight = (b - a) * pairs.inverse_square(h2 + t * t, segments.clamp)
+    else:
+        t, weight = pairs.sample_along_ray(u, a, b, h2, segments.clamp)
+    inverse = lax.rsqrt(jnp.maximum(h2 + t * t, 1e-20))
+    towards = tuple((t * w - p) * inverse for w, p in zip(direction, perpendicular, strict=True))
+    return RayPoint(t + t_closest, weight, (h2 + t * t) * inverse, towards)
+
+
+def shifted(u: Float[Array, "n"], index: Array) -> Float[Array, "n"]:
+    """u of the receiver turned by the light's share of the golden section: every light meets a ray elsewhere."""
+    shift = index.astype(jnp.uint32) * jnp.uint32(2654435769)
+    v = u + (shift >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+    return v - jnp.floor(v)
+
+
+def add(total: Vector, value: Vector) -> Vector:
+    """Sum of two vectors."""
+    return total[0] + value[0], total[1] + value[1], total[2] + value[2]
+
+
+def _sum_over(function, lights, lanes):
+    """Sum of function(light, index) over all lights; a scan whose body holds several lights."""
+    zero = jnp.zeros(lanes, jnp.float32)
+    number = lights.position.shape[0]
+
+    def body(total, item):
+        return add(total, function(*item)), None
+
+    items = (rows(lights), jnp.arange(number, dtype=jnp.int32))
+    total, _ = lax.scan(body, (zero, zero, zero), items, unroll=_UNROLL)
+    return jnp.stack(total, axis=-1)
+
+
+@partial(jax.jit, static_argnames=("grey", "isotropic", "stratified", "num_evaluations"))
+def gather_segments(
+    segments: Segments,
+    u: Float[Array, "n"],
+    lights: VirtualLights,
+    medium: Medium,
+    *,
+    grey: bool,
+    isotropic: bool,
+    stratified: bool = False,
+    num_evaluations: int = 1,
+) -> Float[Array, "n 3"]:
+    """Radiance that eye rays collect from all lights in a homogeneous, unoccluded medium (L_v of section 4.2).
+
+    sum_i f_p(x) tau(x0, x) tau(x, v_i) min(1/r^2, b) / pdf sigma_s(x) L_i sigma_s f_p(v_i), x = x_i(u). Unbiased for the
+    clamped kernel; `num_evaluations` stratified points per pair.
+    """
+    origin, direction = pairs.components(segments.origin), pairs.components(segments.direction)
+    sigma_t = pairs.components(media.sigma_t(medium))
+
+    def evaluate(light, index):
+        total = None
+        for k in range(num_evaluations):
+            v = (shifted(u, index) + k) * (1.0 / num_evaluations)
+            point = choose_point(origin, direction, segments, light.position, v, stratified=stratified)
+            f = phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
+            scale = point.weight * f * (1.0 / num_evaluations)
+            value = tuple(x * scale for x in leaving(light, point.towards, medium, isotropic=isotropic))
+            column = point.distance + (point.t - segments.t0)
+            value = extinguish(value, sigma_t, column, grey=grey)
+            total = value if total is None else add(total, value)
+        return total
+
+    collected = _sum_over(evaluate, lights, u.shape) * medium.sigma_s
+    return jnp.where((segments.t1 > segments.t0)[:, None], collected, 0.0)
+
+
+@partial(jax.jit, static_argnames=("grey", "isotropic"))
+def gather_points(
+    points: Points, lights: VirtualLights, medium: Medium, *, grey: bool, isotropic: bool
+) -> Float[Array, "n 3"]:
+    """Light of all lights scattered at points towards `outgoing`, homogeneous and unoccluded, clamped (min(1/r^2, b))."""
+    position = pairs.components(points.position)
+    sigma_t = pairs.components(media.sigma_t(medium))
+
+    def evaluate(light, index):
+        delta = tuple(x - v for x, v in zip(position, light.position, strict=True))
+        r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
+        inverse = lax.rsqrt(r2)
+        towards = tuple(d * inverse for d in delta)
+        sent = leaving(light, towards, medium, isotropic=isotropic)
+        received = scattered(points, towards, medium, isotropic=isotropic)
+        scale = pairs.inverse_square(r2, points.clamp)
+        value = tuple(a * b * scale for a, b in zip(sent, received, strict=True))
+        return extinguish(value, sigma_t, r2 * inverse, grey=grey)
+
+    return _sum_over(evaluate, lights, points.position.shape[:1])

@@ -1,0 +1,276 @@
+"""Gathering where a pair is costly (marching, shadow rays): every light is estimated, one of each group is evaluated.
+
+Lights are dealt into groups; inside a group a reservoir keeps one light per receiver with probability proportional to
+its contribution without occlusion and with approximate transmittance (resampling: Talbot et al. 2005). Only the kept
+one needs the true transmittance and a shadow ray. Unbiased whatever the estimate, as long as it is positive; the cost is
+a kernel evaluation per pair and one march and ray per group.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from jaxvol import media
+from jaxvol.methods.instant_multiple_scattering import gathering, pairs, receivers
+from jaxvol.methods.instant_multiple_scattering.gathering import Light
+from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
+from jaxvol.types import Medium
+
+_THICKEST = 30.0  # optical thickness at which the estimate stops falling: it must not underflow to zero
+_LEAST = 1e-3  # share of the mean density that the estimate assumes where the table says there is none
+
+
+class Picks(eqx.Module):
+    """One light of each group for each receiver."""
+
+    light: Int[Array, "k n"]
+    weight: Float[Array, "k n"]  # sum of the group's estimates / the chosen one's, times min(1/r^2, b) / pdf(t)
+    t: Float[Array, "k n"] | None = None  # on the eye ray; None for points
+
+
+class _Reservoir(NamedTuple):
+    total: Float[Array, "n"]
+    estimate: Float[Array, "n"]
+    light: Int[Array, "n"]
+    payload: tuple
+    u: Float[Array, "n"]
+
+
+def _offer(reservoir, estimate, index, payload):
+    """Weighted reservoir of one, on a single uniform that is stretched again after every decision."""
+    total = reservoir.total + estimate
+    share = estimate / jnp.maximum(total, 1e-37)
+    accepts = (reservoir.u < share) & (estimate > 0)
+    rest = jnp.where(accepts, reservoir.u / jnp.maximum(share, 1e-12), (reservoir.u - share) / jnp.maximum(1.0 - share, 1e-12))
+    keep = lambda new, old: jnp.where(accepts, new, old)  # noqa: E731
+    return _Reservoir(
+        total,
+        keep(estimate, reservoir.estimate),
+        keep(index, reservoir.light),
+        tuple(keep(n, o) for n, o in zip(payload, reservoir.payload, strict=True)),
+        jnp.clip(rest, 0.0, 1.0 - 2.0**-24),
+    )
+
+
+def _deal(lights, num_groups):
+    """Rows of the lights as [k, m]: neighbours in the list go to different groups; padded with dark lights."""
+    number = lights.position.shape[0]
+    size = -(-number // num_groups)
+    pad = size * num_groups - number
+
+    def deal(x):
+        return jnp.pad(x, (0, pad)).reshape(size, num_groups).T
+
+    index = jnp.arange(size * num_groups, dtype=jnp.int32).reshape(size, num_groups).T
+    return jax.tree.map(deal, gathering.rows(lights)), jnp.minimum(index, number - 1)
+
+
+def _pick(estimate, lights, u, num_groups, num_payload):
+    """Run the reservoirs: estimate(light, index) -> (value, payload)."""
+    zero = jnp.zeros_like(u)
+
+    def group(_, item):
+        members, indices, k = item
+        start = gathering.shifted(u, k * 7919 + 1)
+        empty = _Reservoir(zero, zero, jnp.zeros(u.shape, jnp.int32), (zero,) * num_payload, start)
+
+        def member(reservoir, row):
+            light, index = row
+            value, payload = estimate(light, index)
+            return _offer(reservoir, value, index, payload), None
+
+        kept, _ = lax.scan(member, empty, (members, indices), unroll=2)
+        scale = jnp.where(kept.total > 0, kept.total / jnp.maximum(kept.estimate, 1e-37), 0.0)
+        return None, (kept.light, scale, *kept.payload)
+
+    members, indices = _deal(lights, num_groups)
+    return lax.scan(group, None, (members, indices, jnp.arange(num_groups, dtype=jnp.int32)))[1]
+
+
+def _mean(value):
+    return (value[0] + value[1] + value[2]) * (1.0 / 3.0)
+
+
+def _mean_density(medium):
+    return 1.0 if medium.density is None else jnp.mean(medium.density)
+
+
+@partial(jax.jit, static_argnames=("num_groups", "isotropic", "stratified"))
+def pick_for_segments(
+    segments: Segments,
+    u: Float[Array, "n"],
+    u_group: Float[Array, "n"],
+    lights: VirtualLights,
+    medium: Medium,
+    *,
+    num_groups: int,
+    isotropic: bool,
+    stratified: bool = False,
+) -> Picks:
+    """For each eye ray and group one light and the point of the ray that it meets."""
+    origin, direction = pairs.components(segments.origin), pairs.components(segments.direction)
+    sigma = jnp.mean(media.sigma_t(medium))
+    mean_density = _mean_density(medium)
+    number = 0 if segments.column is None else segments.column.shape[0]
+    if number:
+        ends = jnp.pad(segments.column, ((1, 0), (0, 0)))
+        length = jnp.maximum(segments.t1 - segments.t0, 1e-30)
+        density = (ends[1:] - ends[:-1]) * (number / length)
+        # A step beside one that holds density is not empty: the table blurs over a step.
+        padded = jnp.pad(density, ((1, 1), (0, 0)), mode="edge")
+        density = jnp.maximum(jnp.maximum(padded[:-2], padded[2:]), density)
+        source = (density + _LEAST * mean_density) * jnp.exp(-jnp.minimum(sigma * ends[1:], _THICKEST))
+        flat = source.reshape(-1)
+        lanes = jnp.arange(u.shape[0])
+
+    def estimate(light, index):
+        v = gathering.shifted(u, index)
+        point = gathering.choose_point(origin, direction, segments, light.position, v, stratified=stratified)
+        value = _mean(gathering.leaving(light, point.towards, medium, isotropic=isotropic))
+        value = value * point.weight
+        value = value * gathering.phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
+        along = point.t - segments.t0
+        depth = sigma * mean_density * point.distance
+        if number:
+            step = jnp.clip((along * (number / length)).astype(jnp.int32), 0, number - 1)
+            value = value * flat[step * u.shape[0] + lanes]
+        else:
+            depth = depth + sigma * along
+        return value * jnp.exp(-jnp.minimum(depth, _THICKEST)), (point.t, point.weight)
+
+    light, scale, t, weight = _pick(estimate, lights, u_group, num_groups, 2)
+    alive = segments.t1 > segments.t0
+    return Picks(light, jnp.where(alive, scale * weight, 0.0), t)
+
+
+@partial(jax.jit, static_argnames=("num_groups", "isotropic"))
+def pick_for_points(
+    points: Points,
+    u: Float[Array, "n"],
+    lights: VirtualLights,
+    medium: Medium | None,
+    *,
+    num_groups: int,
+    isotropic: bool,
+) -> Picks:
+    """For each point and group one light."""
+    position = pairs.components(points.position)
+    sigma = 0.0 if medium is None else jnp.mean(media.sigma_t(medium)) * _mean_density(medium)
+
+    def estimate(light, index):
+        delta, r2, inverse, towards = _between(position, light.position)
+        sent = _mean(gathering.leaving(light, towards, medium, isotropic=isotropic))
+        received = _mean(gathering.scattered(points, towards, medium, isotropic=isotropic))
+        bounded = pairs.inverse_square(r2, points.clamp)
+        value = sent * received * bounded * jnp.exp(-jnp.minimum(sigma * r2 * inverse, _THICKEST))
+        return value, (bounded,)
+
+    light, scale, bounded = _pick(estimate, lights, u, num_groups, 1)
+    return Picks(light, scale * bounded)
+
+
+def _between(position, light):
+    delta = tuple(x - v for x, v in zip(position, light, strict=True))
+    r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
+    inverse = lax.rsqrt(r2)
+    return delta, r2, inverse, tuple(d * inverse for d in delta)
+
+
+def _chosen(lights, index):
+    """The picked light of each lane."""
+    return jax.tree.map(lambda x: x[index], gathering.rows(lights))
+
+
+def shadow_rays(
+    position: Float[Array, "*k n 3"], lights: VirtualLights, picks: Picks
+) -> tuple[Float[Array, "k n 3"], Float[Array, "k n 3"], Float[Array, "k n"]]:
+    """Origin, direction and length of the rays from points to their picked lights, a little short of them."""
+    delta = lights.position[picks.light] - position
+    length = jnp.sqrt(jnp.maximum(jnp.sum(delta * delta, axis=-1), 1e-30))
+    return jnp.broadcast_to(position, delta.shape), delta / length[..., None], length * (1.0 - 1e-4)
+
+
+def points_of(segments: Segments, picks: Picks) -> Float[Array, "k n 3"]:
+    """Where the eye rays meet their picked lights."""
+    return segments.origin + picks.t[..., None] * segments.direction
+
+
+@partial(jax.jit, static_argnames=("isotropic", "num_steps"))
+def evaluate_segments(
+    segments: Segments,
+    picks: Picks,
+    visible: Float[Array, "k n"] | None,
+    lights: VirtualLights,
+    medium: Medium,
+    clamps: Float[Array, "k n"] | None,
+    *,
+    isotropic: bool,
+    num_steps: int,
+) -> Float[Array, "n 3"]:
+    """Radiance that eye rays collect from the picked lights, true transmittance and visibility (None: all visible).
+
+    `clamps` are the clamp distances at the points where they differ from the ray's own least one (None: they do not).
+    """
+    direction = pairs.components(segments.direction)
+    sigma_t = pairs.components(media.sigma_t(medium))
+
+    def body(total, item):
+        index, weight, t, seen, clamp = item
+        light: Light = _chosen(lights, index)
+        x = segments.origin + t[:, None] * segments.direction
+        _, r2, _, towards = _between(pairs.components(x), light.position)
+        f = gathering.phase_value(medium, -pairs.dot(towards, direction), isotropic=isotropic)
+        if clamp is not None:
+            weight = weight * pairs.inverse_square(r2, clamp) / pairs.inverse_square(r2, segments.clamp)
+        scale = weight * f * media.density(medium, x)
+        if seen is not None:
+            scale = scale * seen
+        sent = gathering.leaving(light, towards, medium, isotropic=isotropic)
+        column = receivers.column_between(medium, x, jnp.stack(light.position, -1), num_steps=num_steps)
+        column = column + receivers.column_at(segments, t)
+        value = gathering.extinguish(tuple(s * scale for s in sent), sigma_t, column, grey=False)
+        return gathering.add(total, value), None
+
+    zero = jnp.zeros_like(segments.t0)
+    items = (picks.light, picks.weight, picks.t, visible, clamps)
+    total, _ = lax.scan(body, (zero, zero, zero), items)
+    return jnp.stack(total, axis=-1) * medium.sigma_s
+
+
+@partial(jax.jit, static_argnames=("isotropic", "num_steps"))
+def evaluate_points(
+    points: Points,
+    picks: Picks,
+    visible: Float[Array, "k n"] | None,
+    lights: VirtualLights,
+    medium: Medium | None,
+    *,
+    isotropic: bool,
+    num_steps: int,
+) -> Float[Array, "n 3"]:
+    """Light of the picked lights scattered at points towards `outgoing`."""
+    position = pairs.components(points.position)
+
+    def body(total, item):
+        index, weight, seen = item
+        light: Light = _chosen(lights, index)
+        _, _, _, towards = _between(position, light.position)
+        scale = weight if seen is None else weight * seen
+        sent = gathering.leaving(light, towards, medium, isotropic=isotropic)
+        received = gathering.scattered(points, towards, medium, isotropic=isotropic)
+        value = tuple(a * b * scale for a, b in zip(sent, received, strict=True))
+        if medium is not None:
+            ends = jnp.stack(light.position, -1)
+            column = receivers.column_between(medium, points.position, ends, num_steps=num_steps)
+            value = gathering.extinguish(value, pairs.components(media.sigma_t(medium)), column, grey=False)
+        return gathering.add(total, value), None
+
+    zero = jnp.zeros(points.position.shape[:1], jnp.float32)
+    total, _ = lax.scan(body, (zero, zero, zero), (picks.light, picks.weight, visible))
+    return jnp.stack(total, axis=-1)

@@ -1,0 +1,248 @@
+"""What the method claims of a scene and what it decides before it runs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jaxvol import lights, media
+from jaxvol.layers import Claim
+from jaxvol.types import Camera, Scene
+
+_CLAIMED = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in ("surface", "volume", "multiple"))
+_PICKS_A_MARCH_IS_WORTH = 10  # lights a group: marching and casting cost about ten kernel evaluations
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Static decisions; every field but `skipped` is an argument of `plan` or follows from the scene."""
+
+    num_paths: int
+    num_sets: int
+    max_depth: int
+    mean_free_paths: float | None  # clamp distance times extinction; None = unclamped
+    most_clamp: float  # upper limit of the clamp distance, a length
+    num_levels: int
+    num_chains: int
+    light_stride: int
+    end: str
+    distance: str
+    transmittance: str
+    visibility: str
+    direct_at_vertex: bool
+    sampling: str
+    num_evaluations: int
+    group_size: int
+    eye_steps: int
+    pair_steps: int
+    mip_block: int
+    upsample: int
+    tile: int
+    jitter: bool
+    caster: str
+    grey: bool
+    isotropic: bool
+    costly: bool  # a pair needs marching or a shadow ray: estimate all lights, evaluate picked ones
+    volume: bool  # eye rays collect light in the medium
+    surface: bool  # surfaces reflect light to the eye
+    skipped: tuple[str, ...]
+
+
+CHOICES = {
+    "end": ("clamped", "unclamped", "reduced"),
+    "distance": ("weight", "exponential"),
+    "transmittance": ("true", "local"),
+    "visibility": ("rays", "maps", "none"),
+    "sampling": ("equiangular", "stratified"),
+    "specialize": ("values", "structure"),
+}
+
+
+def claims(scene: Scene) -> tuple[Claim, ...]:
+    """The six layers of light that scattered or reflected at least twice, each complete; none where ior bends rays.
+
+    Classes that the scene cannot contain are claimed as exact zeros.
+    """
+    medium = scene.medium
+    if medium is not None and (medium.boundary is not None or medium.inclusions or medium.ior is not None):
+        return ()
+    return tuple(Claim((name,)) for name in _CLAIMED)
+
+
+def plan(
+    scene: Scene,
+    camera: Camera,
+    *,
+    num_paths: int = 1024,
+    num_sets: int = 1,
+    max_depth: int = 256,
+    mean_free_paths: float | None = 0.5,
+    num_levels: int = 3,
+    num_chains: int = 1,
+    light_stride: int = 2,
+    end: str = "clamped",
+    distance: str = "weight",
+    transmittance: str = "true",
+    visibility: str = "rays",
+    direct_at_vertex: bool = True,
+    sampling: str = "equiangular",
+    num_evaluations: int = 1,
+    group_size: int = _PICKS_A_MARCH_IS_WORTH,
+    eye_steps: int | None = None,
+    pair_steps: int | None = None,
+    mip_block: int = 4,
+    upsample: int = 1,
+    tile: int = 8192,
+    jitter: bool = True,
+    caster: str = "auto",
+    specialize: str = "values",
+) -> Plan:
+    """Decide how to render a scene; eager.
+
+    num_paths: light paths of a set; num_sets: independent sets that are averaged (two or more give a variance).
+    mean_free_paths: clamp distance d = mean_free_paths / local sigma_t, at most a tenth of the scene (None: unclamped).
+    num_levels: compensation steps; 0 = clamped only (biased). num_chains: new vertices per receiver on the first step.
+    light_stride: the vertices of step k gather from one of min(16, stride^k) lights, chosen afresh.
+    end: what happens beyond the last step: "clamped" (loses about (1/3)^(num_levels + 1) of the energy), "unclamped"
+    (unbiased, infinite variance), "reduced" (bound times 16).
+    distance: "weight" or the paper's "exponential"; transmittance to new vertices: "true" or "local" (biased);
+    visibility of new vertices: "rays", "maps" (depth map of the nearest light; biased) or "none" (biased).
+    direct_at_vertex: False leaves out the primary lights there, as the paper's text does (biased).
+    sampling: "equiangular", or "stratified" with num_evaluations points per light (the paper).
+    group_size: where pairs are costly, one light of so many is marched to and tested for occlusion.
+    upsample: evaluate at 1/upsample^2 of the pixels and reconstruct (biased where it interpolates).
+    specialize: "structure" looks at no values (for gradients).
+    Raises ValueError for a medium with a boundary, inclusions or a refractive index, and for values out of range.
+    """
+    _check_medium(scene)
+    given = {
+        "end": end,
+        "distance": distance,
+        "transmittance": transmittance,
+        "visibility": visibility,
+        "sampling": sampling,
+        "specialize": specialize,
+    }
+    for key, value in given.items():
+        if value not in CHOICES[key]:
+            raise ValueError(f"{key}: {value!r} is not allowed, must be one of {', '.join(CHOICES[key])}")
+    least = {"num_paths": 1, "num_sets": 1, "max_depth": 1, "num_levels": 0, "num_chains": 1, "num_evaluations": 1}
+    least.update(group_size=1, mip_block=1, upsample=1, tile=64)
+    for key, low in least.items():
+        if locals()[key] < low:
+            raise ValueError(f"{key}: {locals()[key]} is not allowed, must be >= {low}")
+    if light_stride not in (1, 2, 4, 8, 16):
+        raise ValueError(f"light_stride: {light_stride} is not allowed, must be 1, 2, 4, 8 or 16")
+    if mean_free_paths is not None and not mean_free_paths > 0:
+        raise ValueError(f"mean_free_paths: {mean_free_paths} is not allowed, must be > 0 (or none for no clamping)")
+    medium = scene.medium
+    values = specialize == "values"
+    lit = lights.num_lights(scene) > 0
+    scatters = medium is not None and not (values and _is_dark(medium))
+    reflects = scene.mesh is not None and not (values and _is_black(scene.mesh))
+    tracked = medium is not None and medium.density is not None
+    low, high = _extent(scene)
+    side = float(np.max(high - low))
+    return Plan(
+        num_paths=num_paths,
+        num_sets=num_sets,
+        max_depth=max_depth,
+        mean_free_paths=mean_free_paths,
+        most_clamp=0.1 * side if tracked or scene.mesh is not None else side,
+        num_levels=num_levels if mean_free_paths is not None else 0,
+        num_chains=num_chains,
+        light_stride=light_stride,
+        end=end,
+        distance=distance,
+        transmittance=transmittance,
+        visibility=visibility,
+        direct_at_vertex=direct_at_vertex,
+        sampling=sampling,
+        num_evaluations=num_evaluations,
+        group_size=group_size,
+        eye_steps=_eye_steps(medium) if eye_steps is None else eye_steps,
+        pair_steps=16 if pair_steps is None else pair_steps,
+        mip_block=mip_block,
+        upsample=upsample,
+        tile=tile,
+        jitter=jitter,
+        caster=caster,
+        grey=medium is not None and values and media.is_grey(medium),
+        isotropic=medium is not None and values and media.is_isotropic(medium),
+        costly=tracked or scene.mesh is not None,
+        volume=scatters and lit,
+        surface=reflects and lit and (scatters or scene.mesh is not None),
+        skipped=_skipped(scene, lit, scatters, reflects, values),
+    )
+
+
+def _check_medium(scene):
+    medium = scene.medium
+    if medium is None:
+        return
+    for key, value in (("boundary", medium.boundary), ("inclusions", medium.inclusions or None), ("ior", medium.ior)):
+        if value is not None:
+            raise ValueError(
+                f"medium.{key}: instant_multiple_scattering takes a single medium that fills its box and keeps rays "
+                "straight; use path_tracing or lattice_boltzmann"
+            )
+
+
+def _is_dark(medium):
+    return float(np.max(np.asarray(medium.sigma_s))) == 0.0 or media.is_empty(medium)
+
+
+def _is_black(mesh):
+    brightest = float(np.max(np.asarray(mesh.albedo), initial=0.0))
+    return brightest == 0.0 and (mesh.specular is None or float(np.max(np.asarray(mesh.specular), initial=0.0)) == 0.0)
+
+
+def _extent(scene):
+    corners = []
+    if scene.mesh is not None and scene.mesh.vertices.shape[0]:
+        corners += [np.min(np.asarray(scene.mesh.vertices), axis=0), np.max(np.asarray(scene.mesh.vertices), axis=0)]
+    if scene.medium is not None:
+        corners += list(np.asarray(scene.medium.bounds))
+    if not corners:
+        return np.zeros(3), np.ones(3)
+    return np.min(corners, axis=0), np.max(corners, axis=0)
+
+
+def _eye_steps(medium):
+    """Steps of the table along an eye ray: one for each voxel of the longest axis, within 32 and 256."""
+    if medium is None or medium.density is None:
+        return 0
+    return int(np.clip(8 * -(-max(medium.density.shape) // 8), 32, 256))
+
+
+def _skipped(scene, lit, scatters, reflects, values):
+    reasons = []
+    if not lit:
+        reasons.append("no light: nothing is traced or gathered")
+    if scene.medium is None:
+        reasons.append("no medium: volume layers are exactly zero")
+    elif not scatters:
+        reasons.append("the medium scatters nothing: no virtual lights in it, volume layers are exactly zero")
+    elif scene.medium.density is None:
+        reasons.append("homogeneous medium: flights and transmittance in closed form, no tracking or marching")
+    if scene.mesh is None:
+        reasons.append("no surfaces: no rays are cast, surface layers are exactly zero")
+    elif not reflects:
+        reasons.append("black surfaces: they only occlude, surface layers are exactly zero")
+    if scatters and values and media.is_isotropic(scene.medium):
+        reasons.append("g = 0: no phase function is evaluated")
+    if scatters and values and media.is_grey(scene.medium):
+        reasons.append("grey medium: one transmittance for all channels")
+    if scatters and values and _thickness(scene) < 0.1:
+        reasons.append(
+            f"optically thin (at most {_thickness(scene):.2g} across): multiple scattering is a small share of single; "
+            "still computed"
+        )
+    return tuple(reasons)
+
+
+def _thickness(scene):
+    """Bound on the medium's optical thickness across its box."""
+    medium = scene.medium
+    bounds = np.asarray(medium.bounds)
+    peak = 1.0 if medium.density is None else float(np.max(np.asarray(medium.density)))
+    return float(np.max(np.asarray(media.sigma_t(medium)))) * peak * float(np.linalg.norm(bounds[1] - bounds[0]))

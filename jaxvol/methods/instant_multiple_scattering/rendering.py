@@ -1,0 +1,206 @@
+"""Eye rays in, layers out: sets of lights, tiles of pixels, averages and variances over the sets."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt
+
+from jaxvol import camera as pinhole
+from jaxvol import layers, materials, media, ray_casting, sampling
+from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, stages, virtual_lights
+from jaxvol.methods.instant_multiple_scattering.planning import Plan
+from jaxvol.methods.instant_multiple_scattering.receivers import Points
+from jaxvol.methods.instant_multiple_scattering.stages import Context
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import LightSet
+from jaxvol.types import Camera, Estimate, Scene
+
+_PIXEL = sampling.stream("instant_multiple_scattering.pixel")
+_TERMS = ("surface", "volume", "multiple")
+NAMES = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in _TERMS)
+
+
+def trace_lights(
+    scene: Scene, caster: ray_casting.Caster, plan: Plan, *, seed: int
+) -> tuple[LightSet, dict[str, int]]:
+    """One set of virtual lights and the counts of its paths."""
+    vertices, counts = light_paths.trace(
+        scene, caster, seed=seed, paths=np.arange(plan.num_paths), max_depth=plan.max_depth
+    )
+    found = virtual_lights.virtual_lights(scene, vertices, num_paths=plan.num_paths)
+    return found, {**counts, "num_lights": len(vertices.path)}
+
+
+def make_context(scene: Scene, plan: Plan, *, seed: int, lights: LightSet | None = None) -> tuple[Context, dict[str, int]]:
+    """Trace a set of lights (or take the one given) and prepare what the gathering stages share."""
+    caster = ray_casting.caster_for(scene.mesh, kind=plan.caster)
+    counts: dict[str, int] = {}
+    if lights is None:
+        lights, counts = trace_lights(scene, caster, plan, seed=seed)
+    medium = scene.medium
+    mip = None
+    if medium is not None and medium.density is not None:
+        mip = jnp.asarray(compensation.coarse_density(medium.density, block=plan.mip_block))
+    return Context(scene, caster, lights, mip, plan, seed), counts
+
+
+def gather_rays(
+    context: Context,
+    origin: Float[Array, "n 3"],
+    direction: Float[Array, "n 3"],
+    t: Float[Array, "n"],
+    face: Array,
+    index: UInt[Array, "n"],
+) -> dict[str, Float[Array, "n 3"]]:
+    """The six layers along eye rays whose first hits (t, face) are given; `index` numbers them for random numbers."""
+    plan = context.plan
+    result = {name: jnp.zeros(origin.shape, jnp.float32) for name in NAMES}
+    if plan.volume:
+        _add(result, "volume", _volume(context, origin, direction, t, index))
+    if plan.surface:
+        _add(result, "surface", _surface(context, origin, direction, t, face, index))
+    return result
+
+
+def _add(result, last, sums):
+    for term in _TERMS:
+        result[f"{last}_from_{term}"] = result[f"{last}_from_{term}"] + sums[term]
+
+
+def _scaled(sums, scale):
+    return {name: value * scale for name, value in sums.items()}
+
+
+def _chains(context, points_for, index):
+    """Mean residual over the chains; points_for(chain) gives points and throughput."""
+    total = stages.zero_sums(index.shape[0])
+    if context.plan.num_levels == 0:
+        return total
+    number = context.plan.num_chains
+    for chain in range(number):
+        points, throughput = points_for(chain)
+        found = stages.compensate(context, points, throughput, index, chain=chain)
+        total = {name: total[name] + found[name] / number for name in total}
+    return total
+
+
+def _volume(context, origin, direction, t, index):
+    segments = stages.segments_of(context, origin, direction, t)
+    gathered = stages.gather_segments(context, segments, index)
+    number = context.plan.num_chains
+
+    def eye(chain):
+        u = sampling.uniforms(context.seed, _PIXEL, index, 2)[0]
+        return stages.eye_vertices(context, segments, (u + chain) / number)
+
+    residual = _chains(context, eye, index)
+    return {name: gathered[name] + residual[name] for name in gathered}
+
+
+def _surface(context, origin, direction, t, face, index):
+    scene, plan = context.scene, context.plan
+    hit = ray_casting.hits(scene.mesh, origin, direction, t, face)
+    tau = jnp.ones(origin.shape, jnp.float32)
+    if scene.medium is not None:
+        segments = stages.segments_of(context, origin, direction, jnp.where(hit.valid, hit.t, 0.0))
+        column = segments.t1 - segments.t0 if segments.column is None else segments.column[-1]
+        tau = jnp.exp(-column[:, None] * media.sigma_t(scene.medium))
+    tau = jnp.where(hit.valid[:, None], tau, 0.0)
+    clamp = None
+    if plan.mean_free_paths is not None:
+        clamp = stages.clamp_at(scene, context.mip, hit.position, plan=plan)
+    nothing = jnp.zeros(origin.shape, jnp.float32)
+    surface = materials.surface_at(scene.mesh, face)
+    points = Points(hit.position, -direction, nothing, clamp, hit.valid, hit.normal, surface)
+    u = sampling.uniforms(context.seed, _PIXEL, index, 3)[0]
+    gathered = _scaled(stages.gather_points(context, points, u, stride=1, offset=0), tau)
+    number = context.plan.num_chains
+    residual = _chains(context, lambda chain: (points, tau), index + jnp.uint32(0x40000000))
+    del number
+    return {name: gathered[name] + residual[name] for name in gathered}
+
+
+def _tiles(total, size):
+    for start in range(0, total, size):
+        yield start, min(start + size, total)
+
+
+def render_set(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    seed: int,
+    lights: LightSet | None = None,
+) -> tuple[dict[str, Float[np.ndarray, "HW 3"]], dict[str, int]]:
+    """All pixels lit by one set of virtual lights: layers by name (numpy), and counts."""
+    number = camera.height * camera.width
+    result = {name: np.zeros((number, 3), np.float32) for name in NAMES}
+    if not (plan.volume or plan.surface):
+        return result, {"num_truncated": 0, "num_lights": 0}
+    context, counts = make_context(scene, plan, seed=seed, lights=lights)
+    index = np.arange(number, dtype=np.uint32)
+    for begin, end in _tiles(number, plan.tile):
+        picked = np.full(min(plan.tile, number), end - 1, np.uint32)
+        picked[: end - begin] = index[begin:end]
+        values = gather_rays(context, *eye_rays(context, camera, jnp.asarray(picked)))
+        for name in NAMES:
+            result[name][begin:end] = np.asarray(values[name])[: end - begin]
+    return result, counts
+
+
+def eye_rays(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple:
+    """Origins, directions, first hits (t, face) of the eye rays through pixels, and the pixels' numbers."""
+    index = jnp.asarray(index)
+    xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
+    inside = jnp.float32(0.5)
+    if context.plan.jitter:
+        inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
+    rays = pinhole.generate_rays(camera, xy + inside)
+    t = jnp.full(index.shape, jnp.inf, jnp.float32)
+    face = jnp.full(index.shape, -1, jnp.int32)
+    if context.scene.mesh is not None:
+        t, face = ray_casting.intersect(context.caster, rays.origin, rays.direction, t)
+        t, face = jnp.asarray(t), jnp.asarray(face)
+    return rays.origin, rays.direction, t, face, index
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    seed: int = 0,
+    on_progress: Callable[[float], None] | None = None,
+) -> Estimate:
+    """The six layers, the mean over `plan.num_sets` independent sets of lights, and its variance when there are several.
+
+    Diagnostics: "num_truncated" light paths that were cut at max_depth, "num_lights" virtual lights of all sets.
+    """
+    total = {name: 0.0 for name in NAMES}
+    squares = {name: 0.0 for name in NAMES}
+    counts = {"num_truncated": 0, "num_lights": 0}
+    for k in range(plan.num_sets):
+        images, found = render_set(scene, camera, plan, seed=seed * 65537 + k)
+        for name in NAMES:
+            total[name] = total[name] + images[name].astype(np.float64)
+            squares[name] = squares[name] + np.square(images[name].astype(np.float64))
+        for name in counts:
+            counts[name] += found.get(name, 0)
+        if on_progress is not None:
+            on_progress((k + 1) / plan.num_sets)
+    number = plan.num_sets
+    shape = (camera.height, camera.width, 3)
+    mean = {name: jnp.asarray((total[name] / number).reshape(shape), jnp.float32) for name in NAMES}
+    variance = None
+    if number > 1:
+        spread = {name: np.maximum(squares[name] / number - np.square(total[name] / number), 0.0) for name in NAMES}
+        variance = layers.from_items(
+            {name: jnp.asarray((spread[name] / (number - 1)).reshape(shape), jnp.float32) for name in NAMES}
+        )
+    return Estimate(
+        mean=layers.from_items(mean),
+        variance=variance,
+        num_samples=jnp.float32(number) if number > 1 else None,
+        diagnostics={name: jnp.asarray(value) for name, value in counts.items()},
+    )

@@ -1,0 +1,295 @@
+"""The stages in order for one tile of receivers: gather clamped, then compensate; rays cast between jitted steps.
+
+Results are dictionaries with the keys "surface", "volume" and "multiple": what the light did before its last scattering
+at the receiver. Whether the receiver is in the medium or on a surface decides which layers they belong to.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, UInt
+
+from jaxvol import media, ray_casting, sampling
+from jaxvol import lights as primary
+from jaxvol.methods.instant_multiple_scattering import compensation, gathering, picking, receivers
+from jaxvol.methods.instant_multiple_scattering.planning import Plan
+from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import ORIGIN, LightSet, VirtualLights, blocks
+from jaxvol.types import Scene
+
+_EYE = sampling.stream("instant_multiple_scattering.eye")
+_CHAIN = sampling.stream("instant_multiple_scattering.chain")
+_REDUCED = 0.25  # of the clamp distance: a bound 16 times higher
+
+Sums = dict[str, Float[Array, "n 3"]]
+
+
+class Context(NamedTuple):
+    """What all stages of a set of lights share."""
+
+    scene: Scene
+    caster: ray_casting.Caster
+    lights: LightSet
+    mip: Float[Array, "x y z"] | None
+    plan: Plan
+    seed: int
+
+
+def zero_sums(n: int) -> Sums:
+    """Nothing gathered yet."""
+    return {name: jnp.zeros((n, 3), jnp.float32) for name in ("surface", "volume", "multiple")}
+
+
+def _groups(block: VirtualLights, size: int) -> int:
+    return max(1, -(-block.position.shape[0] // size))
+
+
+def segments_of(
+    context: Context,
+    origin: Float[Array, "n 3"],
+    direction: Float[Array, "n 3"],
+    t_end: Float[Array, "n"],
+) -> Segments:
+    """The part of eye rays inside the medium and before `t_end`, with clamp distance and, in a grid, their table."""
+    return _segments(context.scene, context.mip, origin, direction, jnp.asarray(t_end), plan=context.plan)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _segments(scene, mip, origin, direction, t_end, *, plan):
+    medium = scene.medium
+    t0, t1 = media.box_interval(medium.bounds, origin, direction)
+    t1 = jnp.maximum(jnp.minimum(t1, t_end), t0)
+    clamp = None
+    if plan.mean_free_paths is not None:
+        thickest = jnp.mean(media.sigma_t(medium)) * (1.0 if mip is None else jnp.max(mip))
+        least = compensation.clamp_distance(thickest, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
+        clamp = jnp.broadcast_to(least, t0.shape)
+    segments = Segments(origin, direction, t0, t1, clamp)
+    if medium.density is None:
+        return segments
+    column = receivers.columns_along(segments, medium, num_steps=plan.eye_steps)
+    return Segments(origin, direction, t0, t1, clamp, column)
+
+
+@partial(jax.jit, static_argnames="plan")
+def clamp_at(scene: Scene, mip: Float[Array, "x y z"] | None, position: Float[Array, "n 3"], *, plan: Plan):
+    """Clamp distance at points: a function of the receiver alone, one for all channels, so that the split is exact."""
+    sigma = compensation.local_sigma(scene.medium, mip, position)
+    return compensation.clamp_distance(sigma, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
+
+
+def gather_segments(context: Context, segments: Segments, index: UInt[Array, "n"]) -> Sums:
+    """Clamped (or unclamped) light of all virtual lights along eye rays."""
+    plan, medium = context.plan, context.scene.medium
+    sums = zero_sums(index.shape[0])
+    u = sampling.uniforms(context.seed, _EYE, index, 0)
+    stratified = plan.sampling == "stratified"
+    for number, (name, block) in enumerate(blocks(context.lights)):
+        if not plan.costly:
+            value = gathering.gather_segments(
+                segments,
+                u[0],
+                block,
+                medium,
+                grey=plan.grey,
+                isotropic=plan.isotropic,
+                stratified=stratified,
+                num_evaluations=plan.num_evaluations,
+            )
+        else:
+            u_group = sampling.uniforms(context.seed, _EYE, index, 1 + number)[0]
+            picks = picking.pick_for_segments(
+                segments,
+                u[0],
+                u_group,
+                block,
+                medium,
+                num_groups=_groups(block, plan.group_size),
+                isotropic=plan.isotropic,
+                stratified=stratified,
+            )
+            value = _evaluate_segments(context, segments, picks, block)
+        sums[ORIGIN[name]] = sums[ORIGIN[name]] + value
+    return sums
+
+
+def _evaluate_segments(context, segments, picks, block):
+    plan = context.plan
+    position = picking.points_of(segments, picks)
+    visible, clamps = None, None
+    if context.scene.mesh is not None:
+        rays = picking.shadow_rays(position, block, picks)
+        visible = ~jnp.asarray(ray_casting.occluded(context.caster, *rays))
+    if context.mip is not None and plan.mean_free_paths is not None:
+        clamps = clamp_at(context.scene, context.mip, position, plan=plan)
+    return picking.evaluate_segments(
+        segments, picks, visible, block, context.scene.medium, clamps, isotropic=plan.isotropic, num_steps=plan.pair_steps
+    )
+
+
+def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, stride: int, offset: int) -> Sums:
+    """Clamped (points.clamp None: unclamped) light of one of `stride` virtual lights, weighted up, at points."""
+    plan, medium = context.plan, context.scene.medium
+    sums = zero_sums(u.shape[0])
+    for name, block in blocks(context.lights):
+        if stride > 1:
+            block = subset(block, jnp.int32(offset % stride), stride=stride)
+        if not plan.costly:
+            value = gathering.gather_points(points, block, medium, grey=plan.grey, isotropic=plan.isotropic)
+        else:
+            picks = picking.pick_for_points(
+                points, u, block, medium, num_groups=_groups(block, plan.group_size), isotropic=plan.isotropic
+            )
+            visible = None
+            if context.scene.mesh is not None:
+                origin = lifted(context.scene, points)
+                visible = ~jnp.asarray(ray_casting.occluded(context.caster, *picking.shadow_rays(origin, block, picks)))
+            value = picking.evaluate_points(
+                points, picks, visible, block, medium, isotropic=plan.isotropic, num_steps=plan.pair_steps
+            )
+        sums[ORIGIN[name]] = sums[ORIGIN[name]] + value
+    return sums
+
+
+@jax.jit
+def lifted(scene: Scene, points: Points) -> Float[Array, "n 3"]:
+    """Points, those on surfaces moved off them to the side of `outgoing`."""
+    if points.on_surface is None:
+        return points.position
+    moved = ray_casting.offset_origin(
+        points.position, points.normal, points.outgoing, scale=ray_casting.scene_scale(scene.mesh)
+    )
+    return jnp.where(points.on_surface[:, None], moved, points.position)
+
+
+@partial(jax.jit, static_argnames="stride")
+def subset(lights: VirtualLights, offset: Array, *, stride: int) -> VirtualLights:
+    """Every `stride`-th light from `offset` on, weighted up: unbiased when `offset` is uniform in 0 ... stride - 1."""
+
+    def thin(x):
+        return x.reshape(x.shape[0] // stride, stride, *x.shape[1:])[:, offset]
+
+    scaled = jax.tree.map(thin, lights)
+    specular = None if scaled.specular is None else scaled.specular * stride
+    return VirtualLights(
+        scaled.position, scaled.direction, scaled.strength * stride, scaled.normal, specular, scaled.exponent
+    )
+
+
+def eye_vertices(context: Context, segments: Segments, u: Float[Array, "n"]) -> tuple[Points, Float[Array, "n 3"]]:
+    """One point of each eye ray by transmittance, and its weight: what carries the residual there to the eye."""
+    return _eye_vertices(context.scene, context.mip, segments, u, plan=context.plan)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _eye_vertices(scene, mip, segments, u, *, plan):
+    medium = scene.medium
+    extinction = media.sigma_t(medium)
+    sigma = jnp.mean(extinction)
+    t, inverse_pdf = receivers.sample_transmittance(segments, u, sigma)
+    position = segments.origin + t[:, None] * segments.direction
+    column = receivers.column_at(segments, t)
+    throughput = inverse_pdf[:, None] * jnp.exp(-column[:, None] * extinction)
+    scattering = jnp.broadcast_to(medium.sigma_s, position.shape)
+    clamp = clamp_at(scene, mip, position, plan=plan)
+    points = Points(position, -segments.direction, scattering, clamp)
+    if scene.mesh is not None:
+        nowhere = jnp.full(t.shape, -1, jnp.int32)
+        hit = ray_casting.hits(scene.mesh, position, segments.direction, jnp.full(t.shape, jnp.inf), nowhere)
+        surface = receivers.no_surface(scene.mesh, t.shape[0])
+        points = Points(position, -segments.direction, scattering, clamp, nowhere >= 0, hit.normal, surface)
+    return points, throughput
+
+
+def compensate(
+    context: Context, points: Points, throughput: Float[Array, "n 3"], index: UInt[Array, "n"], *, chain: int
+) -> Sums:
+    """The residual of clamping at points (section 4.3), through `num_levels` new vertices one after the other."""
+    plan, scene = context.plan, context.scene
+    sums = zero_sums(index.shape[0])
+    for level in range(plan.num_levels):
+        dimension = 8 * (chain * plan.num_levels + level)
+        u = sum((sampling.uniforms(context.seed, _CHAIN, index, dimension + i) for i in range(4)), ())
+        proposal = compensation.propose(scene, points, u[0], u[1], u[2])
+        s, face = _surface_within(context, points, proposal)
+        sigma = compensation.local_sigma(scene.medium, context.mip, points.position)
+        steps = max(4, plan.pair_steps // 4)
+        points, gain = compensation.new_vertices(
+            scene,
+            points,
+            proposal,
+            s,
+            face,
+            u[3],
+            u[4],
+            sigma,
+            distance=plan.distance,
+            transmittance=plan.transmittance,
+            num_steps=steps,
+        )
+        throughput = throughput * gain
+        clamp = clamp_at(scene, context.mip, points.position, plan=plan)
+        last = level == plan.num_levels - 1
+        gathered = clamp
+        if last and plan.end != "clamped":
+            gathered = None if plan.end == "unclamped" else _REDUCED * clamp
+        points = with_clamp(points, gathered)
+        stride = min(16, plan.light_stride ** (level + 1))
+        offset = int(sampling.uniforms(context.seed, _CHAIN, jnp.uint32(chain), jnp.uint32(level), 7)[0] * stride)
+        found = gather_points(context, points, u[5], stride=stride, offset=offset)
+        total = found["surface"] + found["volume"] + found["multiple"]
+        sums["multiple"] = sums["multiple"] + throughput * total
+        if plan.direct_at_vertex:
+            direct = _direct(context, points, (u[6], u[7], u[8]))
+            add_direct(sums, points, throughput * direct, first=level == 0)
+        points = with_clamp(points, clamp)
+    return sums
+
+
+def add_direct(sums: Sums, points: Points, value: Float[Array, "n 3"], *, first: bool) -> None:
+    """Book light that came straight from a primary light to a new vertex, by what the vertex is."""
+    if not first:
+        sums["multiple"] = sums["multiple"] + value
+        return
+    if points.on_surface is None:
+        sums["volume"] = sums["volume"] + value
+        return
+    on = points.on_surface[:, None]
+    sums["surface"] = sums["surface"] + jnp.where(on, value, 0.0)
+    sums["volume"] = sums["volume"] + jnp.where(on, 0.0, value)
+
+
+def with_clamp(points: Points, clamp: Float[Array, "n"] | None) -> Points:
+    """The same points with another clamp distance."""
+    return Points(
+        points.position,
+        points.outgoing,
+        points.scattering,
+        clamp,
+        points.on_surface,
+        points.normal,
+        points.surface,
+    )
+
+
+def _surface_within(context, points, proposal):
+    """The nearest surface within the clamp distance along the proposed directions; nothing with visibility="none"."""
+    n = points.position.shape[0]
+    if context.scene.mesh is None or context.plan.visibility == "none":
+        return jnp.full(n, jnp.inf, jnp.float32), jnp.full(n, -1, jnp.int32)
+    return ray_casting.intersect(context.caster, proposal.origin, proposal.direction, points.clamp)
+
+
+def _direct(context, points, u):
+    scene, plan = context.scene, context.plan
+    if primary.num_lights(scene) == 0:
+        return jnp.zeros_like(points.position)
+    sample, origin = compensation.sample_primary(scene, points, *u)
+    visible = None
+    if scene.mesh is not None:
+        short = sample.distance * (1.0 - 1e-4)
+        visible = ~jnp.asarray(ray_casting.occluded(context.caster, origin, sample.direction, short))
+    steps = max(plan.pair_steps, plan.eye_steps)
+    return compensation.direct_light(scene, points, sample, visible, isotropic=plan.isotropic, num_steps=steps)
