@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 from jaxvol import ray_casting
+from jaxvol.ray_casting import bvh
 from jaxvol.types import Mesh
 
-KINDS = ("embree", "brute")
+KINDS = ("embree", "bvh", "brute")
 
 
 def to_mesh(vertices, faces):
@@ -273,3 +274,17 @@ def test_casters_agree_on_the_bunny(kind, shared_data):
     t_max = np.where(np.isfinite(t), t * rng.choice([0.99, 1.01], 512), 1.0).astype(np.float32)
     blocked = ray_casting.occluded(ray_casting.make_caster(mesh, kind="embree"), origin, direction, t_max)
     assert np.count_nonzero(np.asarray(ray_casting.occluded(other, origin, direction, t_max)) != blocked) <= 1
+
+
+@pytest.mark.parametrize("num", (1, 2, 3, 5, 17))
+def test_the_tree_holds_every_face_once_inside_its_boxes(num):
+    triangles = np.random.default_rng(num).normal(size=(num, 3, 3)).astype(np.float32)
+    nodes, leaf_face = bvh.build(triangles)
+    assert sorted(leaf_face[leaf_face >= 0]) == list(range(num)) and leaf_face.shape[1] <= 2
+    assert len(nodes) == 2 * len(leaf_face)
+    for leaf, faces in enumerate(leaf_face):
+        node = leaf + len(leaf_face)
+        while node >= 1:
+            corners = triangles[faces[faces >= 0]]
+            assert np.all(corners >= nodes[node, 0:3]) and np.all(corners <= nodes[node, 3:6])
+            node //= 2

@@ -10,7 +10,7 @@ from jaxvol import ray_casting
 from jaxvol.segments import is_box, medium_casters, region_at, segments
 from jaxvol.types import Medium, Mesh
 
-KINDS = ("embree", "brute")
+KINDS = ("embree", "bvh")
 
 
 def to_mesh(shape):

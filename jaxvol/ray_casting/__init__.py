@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol.ray_casting import brute_force, closed_meshes, embree
+from jaxvol.ray_casting import brute_force, bvh, closed_meshes, embree
 from jaxvol.ray_casting.brute_force import BruteForce
+from jaxvol.ray_casting.bvh import BVH
 from jaxvol.ray_casting.closed_meshes import Crossings
 from jaxvol.ray_casting.embree import EmbreeCaster
 from jaxvol.ray_casting.surface_points import face_normals, hits, offset_origin, scene_scale
@@ -25,6 +26,7 @@ from jaxvol.ray_casting.topology import num_bodies, outward_normals
 from jaxvol.types import Mesh
 
 __all__ = [
+    "BVH",
     "KINDS",
     "BruteForce",
     "Caster",
@@ -42,8 +44,8 @@ __all__ = [
     "scene_scale",
 ]
 
-KINDS = ("auto", "embree", "brute")
-Caster = BruteForce | EmbreeCaster | None
+KINDS = ("auto", "embree", "bvh", "brute")
+Caster = BruteForce | BVH | EmbreeCaster | None
 _BRUTE_FORCE_FACES = 64  # up to here brute force beats a BVH
 _casters: dict = {}  # (id of a mesh, kind) -> (weak reference to the mesh, caster)
 
@@ -69,13 +71,17 @@ def make_caster(mesh: Mesh | None, *, kind: str = "auto", num_threads: int | Non
     bodies = num_bodies(np.asarray(mesh.vertices), faces)
     if kind == "embree":
         return EmbreeCaster(mesh.vertices, faces, triangles, normals, bodies, num_threads=num_threads)
-    return BruteForce(triangles=jnp.asarray(mesh.vertices)[faces], normals=jnp.asarray(normals), num_bodies=bodies)
+    arrays = {"triangles": jnp.asarray(mesh.vertices)[faces], "normals": jnp.asarray(normals), "num_bodies": bodies}
+    if kind == "brute":
+        return BruteForce(**arrays)
+    nodes, leaf_face = bvh.build(triangles)
+    return BVH(nodes=jnp.asarray(nodes), leaf_face=jnp.asarray(leaf_face), **arrays)
 
 
 def _automatic_kind(mesh):
     if jax.default_backend() == "cpu":
         return "embree"
-    return "brute"
+    return "brute" if mesh.faces.shape[0] <= _BRUTE_FORCE_FACES else "bvh"
 
 
 def caster_for(mesh: Mesh | None, *, kind: str = "auto") -> Caster:
@@ -97,8 +103,7 @@ def intersect(caster: Caster, origin, direction, t_max):
     if caster is None or 0 in batch:
         xp = np if isinstance(caster, EmbreeCaster) else jnp
         return xp.full(batch, np.inf, np.float32), xp.full(batch, -1, np.int32)
-    cast = embree.intersect if isinstance(caster, EmbreeCaster) else brute_force.intersect
-    t, face = cast(caster, *rays)
+    t, face = _implementation(caster).intersect(caster, *rays)
     return t.reshape(batch), face.reshape(batch)
 
 
@@ -107,8 +112,12 @@ def occluded(caster: Caster, origin, direction, t_max):
     batch, rays = _flatten(caster, origin, direction, t_max)
     if caster is None or 0 in batch:
         return (np if isinstance(caster, EmbreeCaster) else jnp).zeros(batch, bool)
-    cast = embree.occluded if isinstance(caster, EmbreeCaster) else brute_force.occluded
-    return cast(caster, *rays).reshape(batch)
+    return _implementation(caster).occluded(caster, *rays).reshape(batch)
+
+
+def _implementation(caster):
+    """The module that casts rays for this kind of caster."""
+    return {BruteForce: brute_force, BVH: bvh, EmbreeCaster: embree}[type(caster)]
 
 
 def crossings(caster: Caster, origin, direction, t_max, *, max_hits: int) -> Crossings:
