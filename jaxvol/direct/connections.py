@@ -1,0 +1,160 @@
+"""Connections from points to one light at a time, and what is left of them after shadows and the medium.
+
+A scene's lights are visited one by one: a `LightRun` is a scene with a single light and how often it is sampled.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxvol import extinction, ray_casting, segments
+from jaxvol.direct.emitters import Emitters, emitters
+from jaxvol.types import Scene
+
+_NEAR = 1.0 - 1e-4  # shadow rays stop short of a light that is itself a surface
+_FIELDS = {
+    "point": "point_lights",
+    "spot": "spot_lights",
+    "directional": "directional_lights",
+    "area": "area_lights",
+    "environment": "environment",
+}
+DELTA = ("point", "spot", "directional")
+
+
+class Connections(eqx.Module):
+    """K ways from each of n points towards a light. `value` is what arrives without shadows and medium."""
+
+    origin: Float[Array, "K n 3"]
+    direction: Float[Array, "K n 3"]  # unit, towards the light
+    distance: Float[Array, "K n"]  # to the light, inf for infinite ones
+    value: Float[Array, "K n 3"]
+
+
+@dataclass(frozen=True)
+class LightRun:
+    """One light, alone in its scene (all emissive faces count as one)."""
+
+    kind: str
+    scene: Scene
+    emitters: Emitters | None = None  # of the kind "area" when there are few faces
+
+
+@dataclass(frozen=True)
+class Context:
+    """What the host loop keeps at hand: casters, tables, lights, the plan."""
+
+    scene: Scene
+    plan: Any
+    caster: ray_casting.Caster
+    medium_casters: tuple[ray_casting.Caster, ...]
+    marching: extinction.MarchingMedium | None
+    lights: tuple[LightRun, ...]
+
+
+def light_runs(scene: Scene) -> tuple[LightRun, ...]:
+    """Every light of the scene by itself; eager."""
+    runs = []
+    bare = Scene(mesh=scene.mesh)
+    for kind, field in _FIELDS.items():
+        lights = getattr(scene, field)
+        if lights is None:
+            continue
+        if kind in DELTA:
+            count = jax.tree.leaves(lights)[0].shape[0]
+            alone = [jax.tree.map(lambda x, i=i: x[i : i + 1], lights) for i in range(count)]
+        else:
+            alone = [lights]
+        for light in alone:
+            runs.append(LightRun(kind, _with(bare, field, light), emitters(scene) if kind == "area" else None))
+    return tuple(runs)
+
+
+def _with(scene, field, value):
+    return eqx.tree_at(lambda s: getattr(s, field), scene, value, is_leaf=lambda x: x is None)
+
+
+def context(scene: Scene, plan: Any, *, caster: ray_casting.Caster = None) -> Context:
+    """Casters and tables for a scene; eager. The caster of the mesh may be given."""
+    return Context(
+        scene=scene,
+        plan=plan,
+        caster=ray_casting.caster_for(scene.mesh) if caster is None else caster,
+        medium_casters=segments.medium_casters(scene.medium),
+        marching=None if scene.medium is None else extinction.marching_medium(scene.medium),
+        lights=light_runs(scene),
+    )
+
+
+@jax.jit
+def _sum(value):
+    return jnp.sum(value, axis=0)
+
+
+@jax.jit
+def _attenuate_and_sum(value, lit, depth):
+    seen = value if lit is None else jnp.where(lit[..., None], value, 0.0)
+    return jnp.sum(seen * jnp.exp(-depth.reshape(value.shape)), axis=0)
+
+
+@jax.jit
+def _carries_light(value):
+    return jnp.max(value, axis=-1) > 0
+
+
+@jax.jit
+def _mask_and_sum(value, lit):
+    return jnp.sum(jnp.where(lit[..., None], value, 0.0), axis=0)
+
+
+def resolve(context: Context, connections: Connections) -> Float[Array, "n 3"]:
+    """What arrives over all K connections of each point: shadows cast, the medium's transmittance multiplied in."""
+    value = connections.value
+    lit = None
+    if context.caster is not None:
+        active = np.asarray(_carries_light(value))
+        distance = np.asarray(connections.distance) * np.float32(_NEAR)
+        blocked = ray_casting.occluded(
+            context.caster, connections.origin, connections.direction, np.where(active, distance, np.float32(-1.0))
+        )
+        lit = active & ~np.asarray(blocked)
+    if context.marching is None:
+        return _sum(value) if lit is None else _mask_and_sum(value, lit)
+    rays = [x.reshape(-1, *x.shape[2:]) for x in (connections.origin, connections.direction, connections.distance)]
+    if segments.is_box(context.scene.medium) and context.scene.medium.density is None:
+        return _attenuate_and_sum(value, lit, _depth(context, *rays))
+    # Marching is dear: only connections that still carry light, padded to few different sizes.
+    lit = np.asarray(_carries_light(value)) if lit is None else lit
+    chosen = np.flatnonzero(lit)
+    result = np.zeros((lit.size, 3), np.float32)
+    if chosen.size:
+        padded = np.concatenate([chosen, np.full(bucket(chosen.size) - chosen.size, chosen[0])])
+        depth = _depth(context, *(np.asarray(x)[padded] for x in rays))
+        result[chosen] = np.exp(-np.asarray(depth)[: chosen.size]) * np.asarray(value).reshape(-1, 3)[chosen]
+    return jnp.asarray(result.reshape(value.shape).sum(axis=0))
+
+
+def _depth(context, origin, direction, distance):
+    return extinction.optical_thickness(
+        context.scene.medium,
+        origin,
+        direction,
+        distance,
+        casters=context.medium_casters,
+        num_steps=context.plan.num_light_steps,
+        marching=context.marching,
+    )
+
+
+def bucket(count: int) -> int:
+    """The next of the sizes 256, 320, 384, 448, 512, 640, ...: at most a quarter more, few compilations."""
+    power = 256
+    while power * 2 <= count:
+        power *= 2
+    step = power // 4
+    return max(256, -(-count // step) * step)

@@ -1,0 +1,49 @@
+"""Low-discrepancy point sets: positions inside a pixel, directions towards lights, shifts of steps.
+
+All are deterministic for a seed. Positions inside a pixel and shifts of steps are the same in every pixel (smooth
+integrands, midpoint accuracy); sets over lights and directions are shifted by a hash of the pixel (Cranley and
+Patterson 1976), so that what error remains is unbiased noise instead of bands.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxvol import sampling
+
+_STREAM = sampling.stream("direct")
+
+
+def kronecker_ratios(num_dimensions: int) -> tuple[float, ...]:
+    """Steps of the R_d sequence (Roberts 2018): powers of 1/x, x the root of x^(d+1) = x + 1."""
+    x = 2.0
+    for _ in range(64):
+        x = (1.0 + x) ** (1.0 / (num_dimensions + 1))
+    return tuple(x**-k for k in range(1, num_dimensions + 1))
+
+
+def pixel_offsets(num: int) -> Float[np.ndarray, "num 2"]:
+    """Positions inside a pixel, in (0, 1)^2, well spread and with mean exactly 1/2."""
+    points = (np.arange(num)[:, None] * np.asarray(kronecker_ratios(2)) + 0.5) % 1.0
+    return (points + 0.5 - points.mean(axis=0)) % 1.0 if num > 1 else np.full((1, 2), 0.5)
+
+
+def step_shift(sample: Int[Array, "n"], num_samples: int) -> Float[Array, "n"]:
+    """Where in each step the node lies, in (0, 1): all samples of a pixel together make a finer midpoint rule."""
+    return (sample.astype(jnp.float32) + 0.5) / num_samples
+
+
+def shifted(
+    seed, pixel: Int[Array, "n"], index: Int[Array, "*m n"], dimension: int, num_dimensions: int
+) -> tuple[Float[Array, "*m n"], ...]:
+    """Point `index` of the R_d sequence, shifted per pixel; up to four coordinates in (0, 1). `dimension` names the set.
+
+    The sequence's phase is kept to 24 bits by integer arithmetic, so that large indices lose nothing.
+    """
+    shift = sampling.uniforms(seed, _STREAM, pixel, dimension)
+    found = []
+    for ratio, start in zip(kronecker_ratios(num_dimensions), shift, strict=False):
+        phase = jnp.asarray(index, jnp.uint32) * jnp.uint32(round(ratio * 2**32))
+        phase = phase + (start * 2.0**32).astype(jnp.uint32)
+        found.append(((phase >> 9).astype(jnp.float32) + 0.5) * jnp.float32(2.0**-23))
+    return tuple(found)
