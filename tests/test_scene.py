@@ -289,7 +289,7 @@ def test_every_example_scene_loads(root):
         text = path.read_text()
         if "shared/data" in text and not (root.parent / "shared" / "data").is_dir():
             continue
-        file = load_scene(path, overrides=["medium.resolution=16"] if "resolution" in text else ())
+        file = load_scene(path, overrides=["medium.resolution=16"] if "\nresolution" in text else ())
         assert file.camera is not None
 
 
