@@ -104,9 +104,16 @@ def sample_emission(
 
 
 def _point(scene, index, rest, u2, u3, u4, u5, center, radius):
-    direction = sampling.sample_uniform_sphere(u4, u5)
-    power = 4.0 * math.pi * scene.point_lights.intensity[index]
-    return scene.point_lights.position[index], direction, power, direction, jnp.zeros(u2.shape, bool)
+    """Towards the scene only: a cone about its bounding sphere, the whole sphere from inside it."""
+    position = scene.point_lights.position[index]
+    delta = center - position
+    distance = jnp.sqrt(jnp.maximum(sampling.dot(delta, delta), 1e-30))
+    outside = distance > radius
+    half_angle = jnp.where(outside, jnp.arcsin(jnp.minimum(radius / distance, 1.0)), math.pi)
+    axis = jnp.where(outside[..., None], delta / distance[..., None], jnp.asarray([0.0, 0.0, 1.0]))
+    direction = sampling.sample_uniform_cone(u4, u5, axis, half_angle)
+    power = scene.point_lights.intensity[index] / sampling.sample_uniform_cone_pdf(half_angle)[..., None]
+    return position, direction, power, direction, jnp.zeros(u2.shape, bool)
 
 
 def _spot(scene, index, rest, u2, u3, u4, u5, center, radius):

@@ -86,9 +86,7 @@ def sample(
     if surface.specular is None:
         return diffuse
     cos_lobe = _integer_or_real_power(u1, 1.0 / (surface.exponent + 1.0))
-    glossy = direction_about(
-        mirror(n, incoming), cos_lobe, jnp.sqrt(jnp.maximum((1.0 - cos_lobe) * (1.0 + cos_lobe), 0.0)), u2
-    )
+    glossy = direction_about(mirror(n, incoming), cos_lobe, jnp.sqrt(jnp.maximum((1.0 - cos_lobe) * (1.0 + cos_lobe), 0.0)), u2)
     return jnp.where((u3 < _specular_probability(surface))[..., None], glossy, diffuse)
 
 

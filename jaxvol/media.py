@@ -105,9 +105,7 @@ def density(medium: Medium, points: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     return jnp.where(inside, near * (1.0 - fx) + far * fx, 0.0)
 
 
-def density_stochastic(
-    medium: Medium, points: Float[Array, "*b 3"], u: tuple[Float[Array, "*b"], ...]
-) -> Float[Array, "*b"]:
+def density_stochastic(medium: Medium, points: Float[Array, "*b 3"], u: tuple[Float[Array, "*b"], ...]) -> Float[Array, "*b"]:
     """One of the eight corner densities, chosen with its trilinear weight: its mean is `density`. One gather.
 
     Exact in distribution inside delta tracking and unbiased inside ratio tracking, which are linear in each lookup.

@@ -27,9 +27,7 @@ def henyey_greenstein(cos_theta: Float[Array, "*b"], g: Float[Array, "*b"]) -> F
     return _INV_4PI * (1.0 - g) * (1.0 + g) / (d * jnp.sqrt(d))
 
 
-def sample_henyey_greenstein(
-    u: Float[Array, "*b"], g: Float[Array, "*b"]
-) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+def sample_henyey_greenstein(u: Float[Array, "*b"], g: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """(cos, sin) of a deflection with density `henyey_greenstein`, exact for every |g| < 1 including 0.
 
     With D = 1 - g + 2 g u: 1 - cos = 2 (1-g)^2 (1-u)(1 + g u) / D^2 and 1 + cos = 2 (1+g)^2 u (1 - g + g u) / D^2; all
@@ -133,9 +131,7 @@ def sample(
     return direction_about(direction, cos_theta, sin_theta, u2), pdf
 
 
-def sample_pdf(
-    medium: Medium, direction: Float[Array, "*b 3"], outgoing: Float[Array, "*b 3"]
-) -> Float[Array, "*b"]:
+def sample_pdf(medium: Medium, direction: Float[Array, "*b 3"], outgoing: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     """The density of `sample`, 1/sr."""
     return evaluate(medium, dot(direction, outgoing))
 

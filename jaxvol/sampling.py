@@ -34,17 +34,13 @@ def stream(name: str) -> int:
     return zlib.crc32(name.encode())
 
 
-def uniforms(
-    seed: ArrayLike, stream: int, index: ArrayLike, dimension: ArrayLike, sample: ArrayLike = 0
-) -> Uniforms:
+def uniforms(seed: ArrayLike, stream: int, index: ArrayLike, dimension: ArrayLike, sample: ArrayLike = 0) -> Uniforms:
     """Four independent uniforms in (0, 1), float32, for a (seed, stream, index, sample, dimension); arguments broadcast.
 
     23 random bits and a half: never 0, never 1.
     """
     mixed = jnp.asarray(seed, jnp.uint32) * jnp.uint32(0x9E3779B9) ^ jnp.uint32(stream)
-    bits = pcg4d(
-        jnp.asarray(index, jnp.uint32), jnp.asarray(dimension, jnp.uint32), jnp.asarray(sample, jnp.uint32), mixed
-    )
+    bits = pcg4d(jnp.asarray(index, jnp.uint32), jnp.asarray(dimension, jnp.uint32), jnp.asarray(sample, jnp.uint32), mixed)
     return tuple(((x >> 9).astype(jnp.float32) + 0.5) * jnp.float32(2.0**-23) for x in bits)
 
 
@@ -96,9 +92,7 @@ def sample_uniform_sphere_pdf() -> float:
     return 1.0 / (4.0 * math.pi)
 
 
-def sample_cosine_hemisphere(
-    u1: Float[Array, "*b"], u2: Float[Array, "*b"], n: Float[Array, "*b 3"]
-) -> Float[Array, "*b 3"]:
+def sample_cosine_hemisphere(u1: Float[Array, "*b"], u2: Float[Array, "*b"], n: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """A direction about n with pdf cos / pi."""
     return direction_about(n, jnp.sqrt(1.0 - u1), jnp.sqrt(u1), u2)
 

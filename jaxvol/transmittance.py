@@ -135,5 +135,3 @@ def _nudge(medium):
     """1e-4 of a coarse cell: far above float32 rounding of positions, far below what the majorant's margin covers."""
     size = media.voxel_size(medium) * medium.majorants.block
     return 1e-4 * jnp.min(size)
-
-

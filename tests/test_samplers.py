@@ -154,9 +154,10 @@ def test_environment_sampler(rotation):
     sky = lights.environment_light(image, rotation_degrees=rotation)
     u1, u2, _, _ = draw(NUM)
     directions, pdf = jax.jit(lights.sample_environment)(sky, u1, u2)
-    assert np.allclose(pdf, lights.sample_environment_pdf(sky, directions), rtol=2e-2) or np.mean(
-        np.abs(pdf / lights.sample_environment_pdf(sky, directions) - 1) > 1e-3
-    ) < 1e-3  # a direction on a cell's border may fall to its neighbour
+    assert (
+        np.allclose(pdf, lights.sample_environment_pdf(sky, directions), rtol=2e-2)
+        or np.mean(np.abs(pdf / lights.sample_environment_pdf(sky, directions) - 1) > 1e-3) < 1e-3
+    )  # a direction on a cell's border may fall to its neighbour
     radiance = lights.environment_radiance(sky, directions)
     estimate = np.asarray(radiance / pdf[:, None], np.float64)
     uniform = sampling.sample_uniform_sphere(*draw(NUM, dimension=5)[:2])
@@ -249,9 +250,7 @@ def test_equiangular_and_exponential_samplers():
 
 
 def test_spot_intensity_is_linear_in_the_angle():
-    spots = SpotLights(
-        jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]), jnp.ones((1, 3)), jnp.array([0.6]), jnp.array([0.2])
-    )
+    spots = SpotLights(jnp.zeros((1, 3)), jnp.array([[0.0, 0, 1]]), jnp.ones((1, 3)), jnp.array([0.6]), jnp.array([0.2]))
     angle = jnp.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
     travel = jnp.stack([jnp.sin(angle), 0 * angle, jnp.cos(angle)], axis=1)
     got = lights.spot_falloff(spots, jnp.zeros(8, jnp.int32), travel)

@@ -11,10 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt
 
-from jaxvol import lights, materials, phase, ray_casting, sampling
+from jaxvol import lights, materials, ray_casting, sampling
 from jaxvol.methods.path_tracing import flight as flights
 from jaxvol.methods.path_tracing import sensors
-from jaxvol.methods.path_tracing.tracking import path_spans, shadow_spans, take_off, track
 from jaxvol.methods.path_tracing.lanes import (
     ARRIVED,
     Casts,
@@ -25,6 +24,7 @@ from jaxvol.methods.path_tracing.lanes import (
     flush,
     group_after,
 )
+from jaxvol.methods.path_tracing.tracking import path_spans, shadow_spans, take_off, track
 from jaxvol.types import Scene
 
 _STREAM = sampling.stream("path_tracing")
