@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 class ConjugateGradients(lx.AbstractLinearSolver):
     """Solve A y = b, A symmetric positive definite, b one array, until |b - A y| <= tolerance |b|.
 
-    Options: `preconditioner` (a symmetric positive definite operator), `y0`. Stats: `num_steps`, `residual`.
+    Starts from zero. Options: `preconditioner` (a symmetric positive definite operator). Stats: `num_steps`, `residual`.
     """
 
     tolerance: float
@@ -28,7 +28,6 @@ class ConjugateGradients(lx.AbstractLinearSolver):
     def compute(self, state, vector: Float[Array, "..."], options: dict[str, Any]):
         operator = state
         preconditioner = options.get("preconditioner")
-        start = options.get("y0", jnp.zeros_like(vector))
         precondition = (lambda r: r) if preconditioner is None else preconditioner.mv
         limit = self.tolerance * self.tolerance * _dot(vector, vector)
 
@@ -37,17 +36,16 @@ class ConjugateGradients(lx.AbstractLinearSolver):
             return (_dot(r, r) > limit) & (step < self.max_steps) & (gamma > 0)
 
         def advance(carry):
-            y, r, p, gamma, step = carry
+            y, r, p, gamma_before, step = carry
+            z = precondition(r)
+            gamma = _dot(r, z)
+            p = z + (gamma / gamma_before) * p
             image = operator.mv(p)
             alpha = gamma / _dot(p, image)
-            y, r = lax.optimization_barrier((y + alpha * p, r - alpha * image))
-            z = precondition(r)
-            gamma_next = _dot(r, z)
-            return y, r, z + (gamma_next / gamma) * p, gamma_next, step + 1
+            return y + alpha * p, r - alpha * image, p, gamma, step + 1
 
-        residual = vector - operator.mv(start)
-        direction = precondition(residual)
-        carry = (start, residual, direction, _dot(residual, direction), 0)
+        nothing = jnp.zeros_like(vector)
+        carry = (nothing, vector, nothing, jnp.ones((), vector.dtype), 0)
         y, r, _, _, num_steps = lax.while_loop(unfinished, advance, carry)
         size = jnp.sqrt(_dot(vector, vector))
         relative = jnp.sqrt(_dot(r, r)) / jnp.where(size > 0, size, 1.0)

@@ -125,8 +125,7 @@ def coefficients(
 ) -> Coefficients:
     """Coefficients from sigma_s h and sigma_a h (scalars or [X, Y, Z]); `wall` marks voxels that reflect diffusely.
 
-    A wall voxel returns `wall_reflectance` of what arrives, spread over the links that lead to voxels without a wall;
-    the rest is lost and counts as escaped.
+    A wall returns `wall_reflectance` of what arrives; the rest is lost and counts as escaped.
     """
     gather, passing = [], []
     own = jnp.zeros_like(scattering)
@@ -140,7 +139,7 @@ def coefficients(
         own = own + num_links * weight * length * gamma
     derived = kind == "pade" and wall is None
     if wall is not None:
-        scattering = jnp.where(wall, wall_reflectance * inward_normaliser(lattice, wall), scattering)
+        scattering = jnp.where(wall, wall_scattering(lattice, wall, wall_reflectance), scattering)
         absorption = jnp.where(wall, 0.0, absorption)
         gather = [jnp.where(wall, 1.0, value) for value in gather]
         passing = [jnp.where(wall, 0.0, value) for value in passing]
@@ -155,15 +154,29 @@ def coefficients(
     )
 
 
-def inward_normaliser(lattice: Lattice, wall: Bool[Array, "X Y Z"]) -> Float[Array, "X Y Z"]:
-    """1 / sum of w_i / l_i over a wall voxel's links that lead to a voxel of the grid without a wall; 0 where there is none."""
-    inside = jnp.logical_not(wall).astype(jnp.float32)
-    share = jnp.zeros_like(inside)
-    for c in lattice.directions:
-        cls = link_class(c)
-        share = share + lattice.weight(cls) / link_length(cls) * shift(inside, tuple(-component for component in c))
-    reached = jnp.logical_and(wall, share > 0)
-    return jnp.where(reached, 1.0 / jnp.where(reached, share, 1.0), 0.0)
+def wall_scattering(
+    lattice: Lattice, wall: Bool[Array, "X Y Z"], reflectance: Float[Array, ""] | float
+) -> Float[Array, "X Y Z"]:
+    """k of wall voxels so that they return `reflectance` of what the medium sends them, by Lambert's law w_i / l_i.
+
+    A wall voxel also exchanges light with its neighbours in the wall; with alpha the share of its links that lead to the
+    medium, rho' = rho / (alpha + rho (1 - alpha)) per visit makes the whole return rho. Walls that no link joins to the
+    medium are black.
+    """
+
+    def share(field):
+        total = jnp.zeros(wall.shape, jnp.float32)
+        for c in lattice.directions:
+            cls = link_class(c)
+            total = total + lattice.weight(cls) / link_length(cls) * shift(field, tuple(-component for component in c))
+        return total
+
+    inward = share(jnp.logical_not(wall).astype(jnp.float32))
+    live = jnp.logical_and(wall, inward > 0)
+    everything = jnp.where(live, inward + share(live.astype(jnp.float32)), 1.0)
+    alpha = inward / everything
+    per_visit = reflectance / jnp.where(live, alpha + reflectance * (1.0 - alpha), 1.0)
+    return jnp.where(live, per_visit / everything, 0.0)
 
 
 def shift(field: Float[Array, "X Y Z"], direction: tuple[int, int, int]) -> Float[Array, "X Y Z"]:
