@@ -4,9 +4,9 @@ Stages: `first_hit` (surfaces, emission, transmittance to the eye), `surface` (L
 (L V E), each light in turn through `connections` (shadows, transmittance towards the light).
 
 Point, spot and directional lights: positions inside the pixel and nodes on the eye ray are midpoint rules, the same for
-every seed; the error is that of the rules (shadow edges, density changes within a cell). Emissive faces and the
-environment: low-discrepancy sets, shifted per pixel by a hash of the seed; unbiased but for transmittance, which is
-marched with one step a voxel (second order). Equi-angular steps: Kulla and Fajardo 2012, "Importance Sampling Techniques
+every seed; the error is that of the rules (edges, density changes within a cell). Emissive faces and the environment:
+low-discrepancy sets, shifted per pixel by a hash of the seed; unbiased but for transmittance, which is marched with one
+step a voxel (second order). Equi-angular steps: Kulla and Fajardo 2012, "Importance Sampling Techniques
 for Path Tracing in Participating Media"; transmittance-warped steps: the same integral inverted numerically.
 
 Cannot: refraction (refused), more than one scattering event.
@@ -57,8 +57,8 @@ def render(
     kit = context(scene, plan, caster=caster)
 
     def make_rays(item, sample):
-        offsets = patterns.pixel_offsets(int(sample.max()) + 1 if sample.size else 1)
-        return _pixel_rays(camera, jnp.asarray(item), jnp.asarray(offsets[sample], jnp.float32))
+        lattice = patterns.pixel_lattice(int(sample[-1]) + 1)[sample]
+        return _pixel_rays(camera, jnp.asarray(item), jnp.asarray(lattice, jnp.float32))
 
     layers = _average(kit, make_rays, camera.height * camera.width, seed, progress, on_stage)
     layers = jax.tree.map(lambda x: x.reshape(camera.height, camera.width, 3), layers)
@@ -69,9 +69,9 @@ def render(
 
 
 @jax.jit
-def _pixel_rays(camera, pixel, offset):
+def _pixel_rays(camera, pixel, lattice):
     row = pixel // camera.width
-    return cameras.generate_rays(camera, jnp.stack([pixel - row * camera.width, row], axis=-1) + offset)
+    return cameras.generate_rays(camera, jnp.stack([pixel - row * camera.width, row], axis=-1) + lattice)
 
 
 def _average(kit: Context, make_rays, num_items: int, seed: int, progress, on_stage) -> Layers:

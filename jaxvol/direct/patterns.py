@@ -1,9 +1,11 @@
 """Low-discrepancy point sets: positions inside a pixel, directions towards lights, shifts of steps.
 
 All are deterministic for a seed. Positions inside a pixel and shifts of steps are the same in every pixel (smooth
-integrands, midpoint accuracy); sets over lights and directions are shifted by a hash of the pixel (Cranley and
-Patterson 1976), so that what error remains is unbiased noise instead of bands.
+integrands, midpoint accuracy; edges are off by at most half a lattice step); sets over lights and directions are shifted
+by a hash of the pixel (Cranley and Patterson 1976), so that what error remains is unbiased noise instead of bands.
 """
+
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,10 +24,19 @@ def kronecker_ratios(num_dimensions: int) -> tuple[float, ...]:
     return tuple(x**-k for k in range(1, num_dimensions + 1))
 
 
-def pixel_offsets(num: int) -> Float[np.ndarray, "num 2"]:
-    """Positions inside a pixel, in (0, 1)^2, well spread and with mean exactly 1/2."""
-    points = (np.arange(num)[:, None] * np.asarray(kronecker_ratios(2)) + 0.5) % 1.0
-    return (points + 0.5 - points.mean(axis=0)) % 1.0 if num > 1 else np.full((1, 2), 0.5)
+def pixel_lattice(num: int) -> Float[np.ndarray, "num 2"]:
+    """Positions inside a pixel: a rank-1 lattice whose x, y and (with `step_shift`) t are each equally spaced midpoints."""
+    index = np.arange(num)
+    first = _coprime(num, 0.618, ())
+    second = _coprime(num, 0.414, (first, num - first))
+    return (np.stack([index * first % num, index * second % num], axis=1) + 0.5) / num
+
+
+def _coprime(num, ratio, taken):
+    """The factor nearest to ratio * num that is coprime to num and, if possible, not taken (nor 1, the steps' own)."""
+    candidates = [k for k in range(1, num + 1) if math.gcd(k, num) == 1]
+    free = [k for k in candidates if k not in (*taken, 1, num - 1)] or candidates
+    return min(free, key=lambda k: abs(k - ratio * num))
 
 
 def step_shift(sample: Int[Array, "n"], num_samples: int) -> Float[Array, "n"]:
