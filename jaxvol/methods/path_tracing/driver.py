@@ -14,8 +14,8 @@ from jax import lax
 
 from jaxvol import ray_casting, segments
 from jaxvol.methods.path_tracing import sensors
-from jaxvol.methods.path_tracing.lanes import Casts, Lanes, idle, num_columns
-from jaxvol.methods.path_tracing.step import Settings, Work, step
+from jaxvol.methods.path_tracing.lanes import Casts, Lanes, Settings, idle, num_columns
+from jaxvol.methods.path_tracing.step import Work, step
 from jaxvol.ray_casting import EmbreeCaster
 from jaxvol.types import Scene
 
@@ -128,7 +128,7 @@ def run(
     """
     caster = ray_casting.caster_for(scene.mesh, kind=kind)
     medium_casters = segments.medium_casters(scene.medium, kind=kind) if settings.bounded else ()
-    lanes = idle(num_lanes, groups=groups, num_shadows=num_shadows, tracked=settings.tracked)
+    lanes = idle(num_lanes, groups=groups, num_shadows=num_shadows, tracked=settings.tracked, equiangular=settings.equiangular)
     film = jnp.zeros((2 * num_pixels, num_columns(groups)), jnp.float32)
     items = num_pixels * num_samples
     work = Work(jnp.uint32(0), jnp.uint32(items), jnp.uint32(first_sample), jnp.int32(first_pixel), num_pixels)

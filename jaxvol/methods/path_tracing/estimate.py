@@ -18,9 +18,9 @@ from jaxvol.methods.path_tracing.lanes import (
     FROM_VOLUME,
     SURFACE_LIGHT,
     VOLUME_LIGHT,
+    Settings,
     possible_groups,
 )
-from jaxvol.methods.path_tracing.step import Settings
 from jaxvol.types import Camera, Estimate, Layers, Medium, Rays, Scene
 
 Progress = Callable[[float], None]
@@ -60,7 +60,7 @@ def plan(
     """Decide what a path tracer of this scene has to do; eager.
 
     `max_scatterings` counts vertices of any kind; `roulette_from` is the number of vertices from which Russian roulette
-    may end a path; `equiangular=None` uses equi-angular distances where point or spot lights stand in or near a
+    may end a path; `equiangular=None` uses equi-angular distances where lights stand in or near a
     homogeneous medium. Raises ValueError for a refractive index other than 1 and for counts out of range.
     """
     if max_scatterings < 0:
@@ -75,10 +75,11 @@ def plan(
     medium = None if drop_medium else scene.medium
     tracked = medium is not None and not media.is_homogeneous(medium)
     lit = lights.num_lights(scene) > 0
-    near = medium is not None and _point_light_near(scene, medium)
+    near = medium is not None and _light_near(scene, medium)
     use_equiangular = near and not tracked if equiangular is None else equiangular
-    if use_equiangular and (tracked or medium is None or (scene.point_lights is None and scene.spot_lights is None)):
-        raise ValueError("equiangular: true needs a homogeneous medium and a point or spot light")
+    placed = any(x is not None for x in (scene.point_lights, scene.spot_lights, scene.area_lights))
+    if use_equiangular and (tracked or medium is None or not placed):
+        raise ValueError("equiangular: true needs a homogeneous medium and a point, spot or area light")
     settings = Settings(
         max_scatterings=min(max_scatterings, 1_000_000) if lit else 0,
         roulette_from=roulette_from,
@@ -108,11 +109,14 @@ def _refuse_refraction(medium: Medium) -> None:
             )
 
 
-def _point_light_near(scene, medium):
-    """Whether a point-like light stands within the medium's box enlarged by half its size."""
+def _light_near(scene, medium):
+    """Whether a light stands within the medium's box enlarged by half its size."""
     bounds = np.asarray(medium.bounds)
     margin = 0.5 * (bounds[1] - bounds[0])
     positions = [np.asarray(x.position) for x in (scene.point_lights, scene.spot_lights) if x is not None]
+    if scene.area_lights is not None:
+        corners = np.asarray(scene.mesh.faces)[np.asarray(scene.area_lights.face)]
+        positions.append(np.asarray(scene.mesh.vertices)[corners].reshape(-1, 3))
     return any(np.any(np.all((p > bounds[0] - margin) & (p < bounds[1] + margin), axis=-1)) for p in positions)
 
 
@@ -131,7 +135,7 @@ def _skipped(scene, medium, drop_medium, settings, lit):
     if medium is not None and not settings.bounded:
         reasons.append("the medium fills its box: one span a ray, no boundary crossings")
     if medium is not None and not settings.equiangular:
-        reasons.append("no equi-angular sampling: no point or spot light near a homogeneous medium")
+        reasons.append("no equi-angular sampling: no light near a homogeneous medium")
     return tuple(reasons)
 
 

@@ -6,6 +6,8 @@ same lane, and the finished sample is flushed to the film once its last shadow r
 A sample's radiance is kept by group; X is the type (surface or volume) of its first vertex from the eye:
 """
 
+from dataclasses import dataclass
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt
@@ -14,6 +16,41 @@ EMISSION, SURFACE_LIGHT, VOLUME_LIGHT, FROM_SURFACE, FROM_VOLUME, FROM_MULTIPLE 
 NUM_GROUPS = 6  # emission; surface_from_light; volume_from_light; X_from_surface; X_from_volume; X_from_multiple
 
 Sums = tuple[Float[Array, "n 3"] | None, ...]  # by group; None where the scene cannot have it
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is static for one compilation of a step."""
+
+    max_scatterings: int
+    roulette_from: int  # number of vertices from which Russian roulette may end a path
+    tracked: bool  # some medium has a density grid: flights are tracked, a few tentative collisions a step
+    tracking_steps: int
+    bounded: bool  # meshes bound the media: the driver supplies spans
+    equiangular: bool
+
+
+class Arrival(eqx.Module):
+    """Where a flight ended."""
+
+    collided: Array
+    position: Array
+    normal: Array  # geometric; of the surface
+    region: Array
+    weight: Array  # of the throughput
+    density: Array  # of the collision by free flight, 1/length (equi-angular MIS)
+    on_surface: Array
+    escaped: Array
+
+
+class Segment(eqx.Module):
+    """The flight that led to a lane's last volume vertex: what equi-angular sampling could have done on it."""
+
+    origin: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]
+    t0: Float[Array, "n"]  # of the media along it
+    t1: Float[Array, "n"]
+    density: Float[Array, "n"]  # of the vertex by free flight, 1/length; 0 where the last vertex is none of these
 
 
 class Shadow(eqx.Module):
@@ -84,6 +121,7 @@ class Lanes(eqx.Module):
     shadows: tuple[Shadow, ...]
     finished: Finished
     flight: Flight | None
+    segment: Segment | None  # only with equi-angular sampling
     recast: Bool[Array, "n"]  # the rays are new and want casting
 
 
@@ -95,7 +133,7 @@ def possible_groups(*, has_mesh: bool, has_medium: bool) -> tuple[int, ...]:
     return tuple(sorted((EMISSION, *surface, *volume, *multiple)))
 
 
-def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: bool) -> Lanes:
+def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: bool, equiangular: bool) -> Lanes:
     """Lanes without work: the next step fills them."""
     n = num_lanes
     f = lambda *shape: jnp.zeros(shape, jnp.float32)  # noqa: E731
@@ -121,6 +159,7 @@ def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: 
         shadows=tuple(Shadow(f(n, 3), x(), f(n), f(n, 3), i(), b(), b(), u()) for _ in range(num_shadows)),
         finished=Finished(sums(), i(), u(), b(), b()),
         flight=Flight(i(), f(n), i(), f(n, 3), i(), b(), i(), u()) if tracked else None,
+        segment=Segment(f(n, 3), x(), f(n), f(n), f(n)) if equiangular else None,
         recast=b(),
     )
 

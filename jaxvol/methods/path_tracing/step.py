@@ -5,8 +5,6 @@ scattering and transmittance over densities; next-event estimation is combined w
 equi-angular with free-flight distances, by the balance heuristic (Veach 1997; Kulla and Fajardo 2012).
 """
 
-from dataclasses import dataclass
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt
@@ -14,11 +12,15 @@ from jaxtyping import Array, Float, Int, UInt
 from jaxvol import lights, materials, ray_casting, sampling
 from jaxvol.methods.path_tracing import flight as flights
 from jaxvol.methods.path_tracing import sensors
+from jaxvol.methods.path_tracing.connect import connect, connect_equiangular, equiangular_density, flown_segment
 from jaxvol.methods.path_tracing.lanes import (
     ARRIVED,
+    Arrival,
     Casts,
     Finished,
     Lanes,
+    Segment,
+    Settings,
     Shadow,
     add_to_group,
     flush,
@@ -28,19 +30,6 @@ from jaxvol.methods.path_tracing.tracking import path_spans, shadow_spans, take_
 from jaxvol.types import Scene
 
 _STREAM = sampling.stream("path_tracing")
-_NEAR = 1.0 - 1e-4  # shadow rays end short of the light's own surface
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is static for one compilation of a step."""
-
-    max_scatterings: int
-    roulette_from: int  # number of vertices from which Russian roulette may end a path
-    tracked: bool  # some medium has a density grid: flights are tracked, a few tentative collisions a step
-    tracking_steps: int
-    bounded: bool  # meshes bound the media: the driver supplies spans
-    equiangular: bool
 
 
 class Work(eqx.Module):
@@ -99,20 +88,7 @@ def _resolve_shadows(lanes, casts, through):
     return eqx.tree_at(lambda x: (x.sums, x.finished.sums, x.shadows), lanes, (sums, late, tuple(shadows)))
 
 
-class _Arrival(eqx.Module):
-    """Where a flight ended."""
-
-    collided: Array
-    position: Array
-    normal: Array  # geometric; of the surface
-    region: Array
-    weight: Array  # of the throughput
-    density: Array  # of the collision by free flight, 1/length (equi-angular MIS)
-    on_surface: Array
-    escaped: Array
-
-
-def _arrive(scene, settings, lanes, casts, ready, u) -> _Arrival:
+def _arrive(scene, settings, lanes, casts, ready, u) -> Arrival:
     ready = ready & ~lanes.starting
     n = ready.shape[0]
     collided = jnp.zeros(n, bool)
@@ -139,10 +115,10 @@ def _arrive(scene, settings, lanes, casts, ready, u) -> _Arrival:
     hit = ray_casting.hits(scene.mesh, lanes.origin, lanes.direction, finite_t, jnp.where(on_surface, casts.face, -1))
     position = jnp.where(on_surface[:, None], hit.position, lanes.origin + finite_t[:, None] * lanes.direction)
     escaped = ready & ~collided & (casts.face < 0)
-    return _Arrival(collided, position, hit.normal, region, weight, density, on_surface, escaped)
+    return Arrival(collided, position, hit.normal, region, weight, density, on_surface, escaped)
 
 
-def _emission(scene, lanes, casts, arrival, throughput):
+def _emission(scene, settings, lanes, casts, arrival, throughput):
     """Light met by the path itself: emissive faces and the environment, weighted against next-event estimation."""
     if scene.area_lights is None and scene.environment is None:
         return jnp.zeros_like(throughput)
@@ -155,6 +131,12 @@ def _emission(scene, lanes, casts, arrival, throughput):
         radiance = jnp.where(arrival.escaped[:, None], sky, radiance)
     face = jnp.where(arrival.on_surface, casts.face, -1)
     other = lights.sample_light_pdf(scene, lanes.origin, lanes.direction, face, casts.t, arrival.normal)
+    if settings.equiangular and scene.area_lights is not None:
+        # Relative to free flight, which brought the path here: see `connect`.
+        on_segment = (lanes.segment.density > 0) & arrival.on_surface
+        rate = equiangular_density(scene, lanes.segment, lanes.origin, arrival.position)
+        extra = other * rate / jnp.where(on_segment, lanes.segment.density, 1.0)
+        other = other + jnp.where(on_segment, extra, 0.0)
     chosen = lanes.pdf > 0
     mis = jnp.where(chosen, lanes.pdf / jnp.maximum(lanes.pdf + other, 1e-37), 1.0)
     return throughput * radiance * mis[:, None]
@@ -169,7 +151,7 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
     count = lanes.num_vertices
     # `group` of light that joins the path as it stands; the last vertex' type rides in `lanes.last_volume`.
     group = group_after(count, lanes.first_volume, lanes.last_volume)
-    met = _emission(scene, lanes, casts, arrival, throughput)
+    met = _emission(scene, settings, lanes, casts, arrival, throughput)
     gone = arrival.on_surface | arrival.escaped
     sums = add_to_group(lanes.sums, group, jnp.where(gone[:, None], met, 0.0))
 
@@ -181,7 +163,7 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
 
     shadows = lanes.shadows
     if shadows:
-        shadow = _connect(
+        shadow = connect(
             scene,
             sensor,
             settings,
@@ -196,7 +178,7 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
         )
         shadows = (_replace(shadows[0], shadow, ready), *shadows[1:])
     if settings.equiangular:
-        extra = _connect_equiangular(scene, settings, lanes, casts, ready, draw(3))
+        extra = connect_equiangular(scene, settings, lanes, casts, ready, draw(3))
         shadows = (shadows[0], _replace(shadows[1], extra, ready))
 
     direction, weight, pdf = _scatter(scene, lanes, arrival, surface, scatter_u)
@@ -214,6 +196,7 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
     go = vertex & alive
     ended = ready & ~lanes.starting & ~go
     pick = lambda new, old: jnp.where(go[:, None] if new.ndim == 2 else go, new, old)  # noqa: E731
+    before = lanes
     lanes = eqx.tree_at(
         lambda x: (
             x.sums,
@@ -245,6 +228,10 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
             ready,
         ),
     )
+    if settings.equiangular:
+        flown = flown_segment(scene, settings, before, casts, arrival)
+        segment = Segment(*(pick(getattr(flown, f), getattr(lanes.segment, f)) for f in Segment.__dataclass_fields__))
+        lanes = eqx.tree_at(lambda x: x.segment, lanes, segment)
     if settings.tracked:
         lanes = take_off(lanes, ready, draw(4)[0])
     return lanes, ended
@@ -253,90 +240,6 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
 def _replace(old: Shadow, new: Shadow, ready):
     pick = lambda a, b: jnp.where(ready[:, None] if a.ndim == 2 else ready, a, b)  # noqa: E731
     return Shadow(*(pick(getattr(new, f), getattr(old, f)) for f in Shadow.__dataclass_fields__))
-
-
-def _connect(scene, sensor, settings, lanes, casts, arrival, throughput, surface, vertex, u, group) -> Shadow:
-    """Next-event estimation at the vertex just made, or at a gathering sensor's own point."""
-    position = jnp.where(lanes.starting[:, None], lanes.origin, arrival.position)
-    found = lights.sample_light(scene, position, u[0], u[1], u[2])
-    value = jnp.zeros_like(throughput)
-    pdf = jnp.zeros_like(found.pdf)
-    active = vertex
-    if scene.medium is not None:
-        scattered = flights.phase_value(scene.medium, arrival.region, sampling.dot(lanes.direction, found.direction))
-        value = jnp.where(arrival.collided[:, None], scattered[:, None] * throughput, value)
-        pdf = jnp.where(arrival.collided, scattered, pdf)
-    if scene.mesh is not None:
-        bsdf = materials.evaluate(surface, arrival.normal, lanes.direction, found.direction)
-        cosine = jnp.abs(sampling.dot(arrival.normal, found.direction))
-        value = jnp.where(arrival.on_surface[:, None], bsdf * cosine[:, None] * throughput, value)
-        surface_pdf = materials.sample_pdf(surface, arrival.normal, lanes.direction, found.direction)
-        pdf = jnp.where(arrival.on_surface, surface_pdf, pdf)
-    if sensors.sees_light(sensor):
-        weight, own = sensors.response(sensor, lanes.pixel, found.direction)
-        value = jnp.where(lanes.starting[:, None], weight[:, None], value)
-        pdf = jnp.where(lanes.starting, own, pdf)
-        active = active | lanes.starting
-    mis = jnp.where(found.delta, 1.0, found.pdf / jnp.maximum(found.pdf + pdf, 1e-37))
-    if settings.equiangular:
-        # A point light's light could also have been found by choosing this distance towards it.
-        other = _equiangular_density(scene, settings, lanes, casts, arrival, found)
-        own = arrival.density / lights.num_lights(scene)
-        mis = jnp.where(
-            arrival.collided & found.delta & jnp.isfinite(found.distance), own / jnp.maximum(own + other, 1e-37), mis
-        )
-    contribution = value * found.radiance * (mis / jnp.maximum(found.pdf, 1e-37))[:, None]
-    origin = position
-    if scene.mesh is not None:
-        off = ray_casting.offset_origin(position, arrival.normal, found.direction, scale=ray_casting.scene_scale(scene.mesh))
-        origin = jnp.where(arrival.on_surface[:, None], off, origin)
-    active = active & (jnp.max(contribution, axis=-1) > 0)
-    return Shadow(
-        origin, found.direction, found.distance * _NEAR, contribution, group, active, jnp.zeros_like(active), lanes.event
-    )
-
-
-def _point_like(scene: Scene) -> Scene:
-    """The lights that equi-angular sampling aims at."""
-    return Scene(point_lights=scene.point_lights, spot_lights=scene.spot_lights)
-
-
-def _media_range(spans):
-    """First entry into and last exit from the media."""
-    return spans[0][:, 0], spans[0][:, -1]
-
-
-def _equiangular_density(scene, settings, lanes, casts, arrival, found):
-    """Density of reaching the vertex by equi-angular sampling towards the light that was chosen for it."""
-    t0, t1 = _media_range(path_spans(scene, settings, lanes, casts))
-    t = sampling.dot(arrival.position - lanes.origin, lanes.direction)
-    pdf = sampling.sample_equiangular_pdf(t, lanes.origin, lanes.direction, t0, t1, found.position)
-    return pdf / lights.num_lights(_point_like(scene))
-
-
-def _connect_equiangular(scene, settings, lanes, casts, ready, u) -> Shadow:
-    """One more vertex on the same flight, at a distance chosen equi-angularly towards a point or spot light."""
-    lit = _point_like(scene)
-    ready = ready & ~lanes.starting & (lanes.num_vertices < settings.max_scatterings)
-    zero = jnp.zeros_like(u[0])
-    target = lights.sample_light(lit, lanes.origin, zero + 0.5, zero + 0.5, u[1]).position
-    spans = path_spans(scene, settings, lanes, casts)
-    t0, t1 = _media_range(spans)
-    t, pdf = sampling.sample_equiangular(u[0], lanes.origin, lanes.direction, t0, t1, target)
-    position = lanes.origin + t[:, None] * lanes.direction
-    found = lights.sample_light(lit, position, zero + 0.5, zero + 0.5, u[1])
-    density, through, region = flights.homogeneous_pdf(scene.medium, spans, lanes.throughput, t)
-    cosine = sampling.dot(lanes.direction, found.direction)
-    scattered = flights.phase_value(scene.medium, region, cosine)
-    # Balance heuristic against free flight followed by the choice of this light among all.
-    own = pdf * found.pdf
-    total = own + density / lights.num_lights(scene)
-    value = lanes.throughput * through * found.radiance * (scattered / jnp.maximum(total, 1e-37))[:, None]
-    active = ready & (t1 > t0) & (jnp.max(value, axis=-1) > 0)
-    ones = jnp.ones_like(ready)
-    first = jnp.where(lanes.num_vertices == 0, ones, lanes.first_volume)
-    group = group_after(lanes.num_vertices + 1, first, ones)
-    return Shadow(position, found.direction, found.distance * _NEAR, value, group, active, jnp.zeros_like(active), lanes.event)
 
 
 def _scatter(scene, lanes, arrival, surface, u):
@@ -402,6 +305,7 @@ def _refill(sensor, settings, seed, lanes, ended, work):
         shadows=shadows,
         finished=finished,
         flight=lanes.flight,
+        segment=lanes.segment,
         recast=lanes.recast | start,
     )
     if settings.tracked:
