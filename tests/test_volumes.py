@@ -95,6 +95,7 @@ def test_npz_keys_and_types(arrays, low, high, dtype, tmp_path):
     ("arrays", "problem"),
     [
         ({"dens": np.ones((2, 2, 2))}, "has no array 'density'; it has dens"),
+        ({"de\nns": np.ones((2, 2, 2))}, "it has de ns"),
         ({"density": np.ones((2, 2))}, r"grid \[x, y, z\]"),
         ({"density": np.ones((2, 0, 2))}, "the grid is empty"),
         ({"density": np.full((2, 2, 2), np.nan)}, "8 of 8 densities are not finite"),
@@ -261,7 +262,7 @@ def test_vdb_takes_the_only_scalar_grid_and_refuses_what_it_cannot_read(tmp_path
     data = path.read_bytes()
     ambiguous = data.replace(b"\x07\0\0\0density\x10\0\0\0Tree_float", b"\x07\0\0\0densitx\x10\0\0\0Tree_float")
     assert "has the grids heat, densitx; one must be named density" in refusal(path, ambiguous)
-    assert "has no float, double or half grid" in refusal(path, data.replace(b"Tree_float", b"Tree_int32"))
+    assert "has no float, double or half grid" in refusal(path, data.replace(b"Tree_float", b"Tree_int\n2"))
     assert "file version 221" in refusal(path, data[:8] + struct.pack("<I", 221) + data[12:])
     assert "without offsets" in refusal(path, data[:20] + b"\0" + data[21:])
 

@@ -45,7 +45,7 @@ def read_npz(path: str | os.PathLike) -> Volume:
             density = _read_array(path, archive, "density")
             if density is None:
                 keys = ", ".join(name.removesuffix(".npy") for name in archive.namelist()[:12]) or "nothing"
-                raise ValueError(f"{path}: has no array 'density'; it has {keys}")
+                raise ValueError(f"{path}: has no array 'density'; it has {_one_line(keys)}")
             check_shape(path, density.shape)
             return checked(path, density, _bounds(path, archive, density.shape))
     except _DAMAGE as error:
@@ -56,8 +56,9 @@ def read_npz(path: str | os.PathLike) -> Volume:
         raise ValueError(f"{path}: is a damaged .npz file ({_one_line(error)})") from error
 
 
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
+def _one_line(text: object) -> str:
+    """What a damaged file may have put into an error or a name, fit to print."""
+    return "".join(c if c.isprintable() else " " for c in str(text))[:200]
 
 
 def _read_array(path: Path, archive: zipfile.ZipFile, key: str) -> np.ndarray | None:

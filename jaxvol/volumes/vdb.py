@@ -31,7 +31,8 @@ class _Stream:
         self.path, self.data, self.position = path, data, 0
 
     def error(self, problem: str) -> ValueError:
-        return ValueError(f"{self.path}: {problem}")
+        printable = "".join(c if c.isprintable() else "?" for c in problem)  # names in a damaged file may hold anything
+        return ValueError(f"{self.path}: {printable}")
 
     def take(self, num_bytes: int) -> bytes:
         end = self.position + num_bytes
