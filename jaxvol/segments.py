@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxvol import media, ray_casting
+from jaxvol.ray_casting.closed_meshes import pack
 from jaxvol.types import Medium
 
 _MOST_SEGMENTS = 16  # default limit; further pieces are rare and are reported
@@ -72,16 +73,16 @@ def segments(
     starts, ends, overflow = [], [], 0
     for part, caster in zip(regions, casters, strict=True):
         start, end = _box_interval(xp, part.bounds, origin, direction)
-        start, end = start[:, None], xp.minimum(end, t_max)[:, None]
+        start, end = start[None], xp.minimum(end, t_max)[None]
         if caster is not None:
             found = ray_casting.crossings(caster, origin, direction, t_max, max_hits=max_hits)
             overflow = overflow + found.num_overflows
             entry, exit_ = _intervals(xp, found)
             start, end = xp.maximum(start, entry), xp.minimum(end, exit_)
         empty = ~(start < end)
-        starts.append(xp.where(empty, np.inf, start))
-        ends.append(xp.where(empty, np.inf, end))
-    most = 2 * sum(s.shape[1] for s in starts) - 1
+        starts.append(xp.where(empty, np.float32(np.inf), start))
+        ends.append(xp.where(empty, np.float32(np.inf), end))
+    most = 2 * sum(s.shape[0] for s in starts) - 1
     return _cut(xp, starts, ends, overflow, min(most, _MOST_SEGMENTS) if max_segments is None else max_segments)
 
 
@@ -126,43 +127,52 @@ def _array_module(casters):
 def _box_interval(xp, bounds, origin, direction):
     """`media.box_interval` for numpy or JAX arrays."""
     bounds = xp.asarray(bounds, np.float32)
-    tiny = xp.where(xp.abs(direction) < 1e-20, xp.where(direction < 0, -1e-20, 1e-20), direction)
-    inverse = xp.float32(1.0) / tiny
-    a, b = (bounds[0] - origin) * inverse, (bounds[1] - origin) * inverse
-    return xp.maximum(xp.max(xp.minimum(a, b), 1), 0.0), xp.min(xp.maximum(a, b), 1)
+    start, end = np.float32(0.0), np.float32(np.inf)
+    for i in range(3):
+        d = direction[:, i]
+        inverse = 1 / xp.where(xp.abs(d) < 1e-20, xp.where(d < 0, np.float32(-1e-20), np.float32(1e-20)), d)
+        a, b = (bounds[0, i] - origin[:, i]) * inverse, (bounds[1, i] - origin[:, i]) * inverse
+        start, end = xp.maximum(start, xp.minimum(a, b)), xp.minimum(end, xp.maximum(a, b))
+    return start, end
 
 
 def _intervals(xp, found):
-    """(entry, exit) [n, J] of the intervals inside a mesh; entry = inf where there are no more, the last may stay open."""
-    n, num = found.t.shape
-    rest = xp.full((n, 1), np.inf, np.float32)
-    from_origin = xp.concatenate([xp.zeros_like(rest), found.t], 1)
-    ends = xp.where(found.inside[:, None], from_origin, xp.concatenate([found.t, rest], 1))
-    if num % 2 == 0:
-        ends = xp.concatenate([ends, rest], 1)
-    return ends[:, 0::2], ends[:, 1::2]
+    """(entry, exit) [J, n] of the intervals inside a mesh; entry = inf where there are no more, the last may stay open."""
+    t = found.t.T
+    rest = xp.full_like(t[:1], np.inf)
+    ends = xp.where(found.inside, xp.concatenate([xp.zeros_like(rest), t]), xp.concatenate([t, rest]))
+    if len(ends) % 2:
+        ends = xp.concatenate([ends, rest])
+    return ends[0::2], ends[1::2]
 
 
 def _cut(xp, starts, ends, overflow, max_segments):
-    """Pieces from the intervals [n, J_i] of each region i (inf, inf where there are no more); later regions win."""
-    t = xp.sort(xp.concatenate([*starts, *ends], 1), 1)
-    low, high = t[:, :-1], t[:, 1:]
+    """Pieces from the intervals [J_i, n] of each region i (inf, inf where there are no more); later regions win."""
+    t = xp.sort(xp.concatenate([*starts, *ends]), 0)
+    if xp is np:  # rays rarely use all rows
+        t = t[: 1 + np.count_nonzero(np.any(np.isfinite(t[1:]), 1))]
+    low, high = t[:-1], t[1:]
     owner = xp.full(low.shape, -1, np.int32)
     for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
         inside = xp.zeros(low.shape, bool)
-        for j in range(start.shape[1]):
-            inside = inside | ((start[:, j, None] <= low) & (high <= end[:, j, None]))
+        for j in range(len(start)):
+            inside = inside | ((start[j] <= low) & (high <= end[j]))
         owner = xp.where(inside, np.int32(i), owner)
     exists = (low < high) & xp.isfinite(high)
-    last = xp.max(xp.where(xp.isfinite(t), t, 0.0), 1)
-    out_t = xp.broadcast_to(last[:, None], (len(t), max_segments + 1))
-    out_region = xp.full((len(t), max_segments), -1, np.int32)
-    count, before = xp.zeros(len(t), np.int32), xp.full(len(t), -2, np.int32)
-    for m in range(low.shape[1]):
-        begins = exists[:, m] & (owner[:, m] != before)
-        slot = begins[:, None] & (xp.arange(max_segments + 1) == count[:, None])
-        out_t = xp.where(slot, low[:, m, None], out_t)
-        out_region = xp.where(slot[:, :-1], owner[:, m, None], out_region)
-        count = count + begins
-        before = xp.where(exists[:, m], owner[:, m], before)
-    return Segments(t=out_t, region=out_region, num_overflows=overflow + xp.sum(count > max_segments))
+    begins, before = [], xp.full(t.shape[1], -2, np.int32)
+    for m in range(len(low)):
+        begins.append(exists[m] & (owner[m] != before))
+        before = xp.where(exists[m], owner[m], before)
+    last = xp.max(xp.where(xp.isfinite(t), t, np.float32(0.0)), 0)
+    if not begins:
+        begins = [xp.zeros(t.shape[1], bool)]
+        low, owner = t, xp.full(t.shape, -1, np.int32)
+    begins = xp.stack(begins)
+    row = xp.cumsum(begins, 0) - 1
+    out_t = pack(xp, begins, row, low, np.inf, max_segments + 1)
+    region = pack(xp, begins, row, owner, -1, max_segments)
+    return Segments(
+        t=xp.minimum(out_t, last).T,
+        region=region.T,
+        num_overflows=overflow + xp.sum(row[-1] >= max_segments),
+    )

@@ -111,13 +111,22 @@ def test_rays_at_edges_and_vertices_of_a_closed_mesh_do_not_leak(kind):
         edges = vertices[sphere.edges_unique]
         weight = rng.uniform(size=(20, len(edges), 1)).astype(np.float32)
         targets = np.concatenate([vertices, (edges[:, 0] + weight * (edges[:, 1] - edges[:, 0])).reshape(-1, 3)])
-        origin = np.asarray(offset + rng.uniform(-0.5, 0.5, targets.shape), np.float32)
-        direction = targets - origin
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        t, _ = ray_casting.intersect(caster, origin, direction, np.inf)
-        assert np.all(np.isfinite(np.asarray(t)))
-        np.testing.assert_allclose(np.asarray(t), np.linalg.norm(targets - origin, axis=1), rtol=1e-5)
-        assert np.all(np.asarray(ray_casting.occluded(caster, origin, direction, np.inf)))
+        inside = rng.uniform(-0.5, 0.5, targets.shape)
+        for start in (inside, 4 * (targets - offset), np.roll(targets - offset, 5, axis=0) * 3):
+            origin = np.asarray(offset + start, np.float32)
+            direction = targets - origin
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            t, _ = (np.asarray(x) for x in ray_casting.intersect(caster, origin, direction, np.inf))
+            # Rays into the ball meet it where they enter, by the planes of its faces in float64.
+            height = (origin - sphere.triangles[:, 0, None] - offset) * sphere.face_normals[:, None]
+            facing = sphere.face_normals @ direction.T
+            entry = np.max(np.where(facing < -1e-9, -height.sum(-1) / np.where(facing < -1e-9, facing, 1), -np.inf), 0)
+            leave = np.min(np.where(facing > 1e-9, -height.sum(-1) / np.where(facing > 1e-9, facing, 1), np.inf), 0)
+            deep = (leave - entry > 0.01) & (leave > 0)
+            expected = np.where(entry > 0, entry, leave)
+            np.testing.assert_allclose(t[deep], expected[deep], atol=2e-5)
+            assert np.count_nonzero(deep) > 1000
+            assert np.all(np.asarray(ray_casting.occluded(caster, origin, direction, np.inf))[deep])
 
 
 @pytest.mark.parametrize("kind", KINDS)

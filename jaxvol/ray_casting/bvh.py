@@ -22,7 +22,7 @@ _LEAF_FACES = 2
 _NODE_STEPS = 2  # between two rounds of triangle tests
 _BLOCK = {"cpu": 256}  # lanes; elsewhere:
 _LARGE_BLOCK = 1 << 20
-_SLACK = 1.0 + 4 * 1.2e-7  # roundings of the slab test, so that boxes are never missed where their triangles are hit
+_SLACK = 2.0**-21  # of the coordinates: boxes grow by the rounding errors of the triangle test
 
 
 class BVH(eqx.Module):
@@ -83,17 +83,19 @@ def _traverse(nodes, leaf_face, triangles, origin, direction, t_max, any_hit):
     o, frame = coordinates(origin), ray_frame(direction)
     d = frame[2]
     inverse = tuple(1.0 / jnp.where(jnp.abs(x) < 1e-20, jnp.where(x < 0, -1e-20, 1e-20), x) for x in d)
+    size = jnp.max(jnp.abs(nodes[1, :6])) + jnp.maximum(jnp.abs(o[0]), jnp.maximum(jnp.abs(o[1]), jnp.abs(o[2])))
+    o_low, o_high = (tuple(x + sign * _SLACK * size for x in o) for sign in (1, -1))
     negative = tuple((x < 0).astype(jnp.int32) for x in d)
 
     def node_step(_, state):
         node, visit, waiting, t_best = state
         row = nodes[node]
-        t0 = [(row[:, i] - o[i]) * inverse[i] for i in range(3)]
-        t1 = [(row[:, i + 3] - o[i]) * inverse[i] for i in range(3)]
+        t0 = [(row[:, i] - o_low[i]) * inverse[i] for i in range(3)]
+        t1 = [(row[:, i + 3] - o_high[i]) * inverse[i] for i in range(3)]
         near, far = ([f(a, b) for a, b in zip(t0, t1, strict=True)] for f in (jnp.minimum, jnp.maximum))
         entry = jnp.maximum(jnp.maximum(near[0], near[1]), jnp.maximum(near[2], 0.0))
         exit_ = jnp.minimum(jnp.minimum(far[0], far[1]), far[2])
-        hit = entry <= jnp.minimum(exit_, t_best) * _SLACK
+        hit = entry <= jnp.minimum(exit_, t_best)
         axis = row[:, 6]
         farther = jnp.where(axis == 0.0, negative[0], jnp.where(axis == 1.0, negative[1], negative[2]))
         is_leaf = node >= num_leaves
