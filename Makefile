@@ -4,7 +4,7 @@ SCENE ?= experiments/scenes/cornell_fog.toml
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: install render test test-slow lint clean
+.PHONY: install render pictures test test-slow lint clean
 
 install: $(INSTALLED)
 
@@ -15,6 +15,12 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 render: $(INSTALLED)  ## a fog-filled Cornell box (or SCENE=file.toml) into out/
 	$(BIN)/jaxvol render $(SCENE) --out out
+
+pictures: $(INSTALLED)  ## the README's pictures
+	for scene in cornell_fog cloud plume; do \
+		$(BIN)/jaxvol render experiments/scenes/$$scene.toml --out out/pictures || exit 1; \
+		cp out/pictures/$$scene.png docs/images/; \
+	done
 
 test: $(INSTALLED)  ## the suite without its slow statistical part
 	$(BIN)/python -m pytest -q
