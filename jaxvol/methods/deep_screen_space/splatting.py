@@ -134,6 +134,11 @@ def level_rays(
     )
 
 
+def _rows(array, index):
+    """array[index] for indices known to be in range: the checks of an ordinary gather cost as much as a pair."""
+    return array.at[index].get(mode="promise_in_bounds")
+
+
 @partial(jax.jit, static_argnames=("phase", "batch", "glossy"))
 def splat(
     rays: LevelRays,
@@ -165,21 +170,21 @@ def splat(
         t = jnp.where(valid, lax.dynamic_slice_in_dim(tile, index * batch, batch), num_tiles)
         k = jnp.where(valid, lax.dynamic_slice_in_dim(group, index * batch, batch), 0)
         safe = jnp.minimum(t, num_tiles - 1)
-        direction = rays.direction[safe]
+        direction = _rows(rays.direction, safe)
         ray = (direction[:, 0], direction[:, 1], direction[:, 2])
-        distance = rays.distance[safe]
+        distance = _rows(rays.distance, safe)
         distances = [distance[:, n] for n in range(num_samples)]
         factors = None
         if transport is not None:
-            cells = rays.cell[safe]
-            cluster = surfels.cluster[k][:, None] * transport.shape[1]
-            factors = [transport.reshape(-1)[cluster + cells[:, n]] for n in range(num_samples)]
+            cells = _rows(rays.cell, safe)
+            cluster = _rows(surfels.cluster, k)[:, None] * transport.shape[1]
+            factors = [_rows(transport.reshape(-1), cluster + cells[:, n]) for n in range(num_samples)]
         if rays.weight is not None:
-            weight = rays.weight[safe]
+            weight = _rows(rays.weight, safe)
             weights = [[weight[:, n, c] for n in range(num_samples)] for c in range(3)]
             if factors is not None:
                 weights = [[w * f for w, f in zip(channel, factors, strict=True)] for channel in weights]
-        rows = surfels.row[k]
+        rows = _rows(surfels.row, k)
 
         def one_surfel(m, sums):
             row = lax.dynamic_index_in_dim(rows, m, 1, keepdims=False)
