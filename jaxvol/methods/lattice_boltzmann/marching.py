@@ -1,0 +1,321 @@
+"""Marching pass (section III-B): light rays through the voxels, leaving behind the fluence that the lattice scatters.
+
+Straight media: from voxel face to voxel face, exact lengths, exact exponentials. Refractive media: Hamilton's equations
+of the eikonal in voxel units, dx/dtau = p, dp/dtau = D = grad (n^2/2), by leapfrog (drift, kick, drift; ds = n dtau),
+with the energy put back along the gradient so that |p| = n (planar Snell then holds at any step). `integrator="euler"`
+is the paper's eq. 2-3. Fig. 4 of the paper mixes two forms (v += delta grad n / n), does not converge, and is not offered.
+
+Deposited is the track, power times length in voxels: the fluence times h^2 [W] of light that comes from the lights. A
+voxel scatters scattering * track and absorbs absorption * track, exactly what the ray loses, so that
+scattered + absorbed + escaped = sent. Rays are re-packed every `_ROUND` steps, so that dead ones cost nothing.
+"""
+
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials
+
+Integrator = Literal["leapfrog", "euler"]
+_ROUND = 32  # steps between re-packings
+_BATCH = 1 << 16  # rays at a time
+_WEAKEST = 1e-4  # rays that carry less than this share of the start are ended, their rest counted as live
+
+
+class Marched(NamedTuple):
+    """What marching left behind, and its books (W): sent into the grid, still live at the end."""
+
+    track: Float[Array, "C X Y Z"]
+    sent: np.ndarray  # [C]
+    live: np.ndarray  # [C]
+    escaped: np.ndarray  # [C]
+    num_steps: int  # ray steps that were computed
+
+
+class _Straight(NamedTuple):
+    voxel: tuple[Int[Array, "n"], Int[Array, "n"], Int[Array, "n"]]
+    t_next: tuple[Float[Array, "n"], ...]
+    t_step: tuple[Float[Array, "n"], ...]
+    step: tuple[Int[Array, "n"], ...]
+    t: Float[Array, "n"]
+    t_end: Float[Array, "n"]
+    power: tuple[Float[Array, "n"], ...]
+    start: tuple[Float[Array, "n"], ...]
+
+
+class _Bent(NamedTuple):
+    position: Float[Array, "n 3"]  # voxel units, 0 at the lower faces
+    momentum: Float[Array, "n 3"]  # n times the unit direction
+    index: Float[Array, "n"]
+    power: tuple[Float[Array, "n"], ...]
+    start: tuple[Float[Array, "n"], ...]
+    inside: Bool[Array, "n"]
+
+
+def to_voxels(grid: Grid, origin: np.ndarray, direction: np.ndarray, t_max: np.ndarray):
+    """Rays in voxel units, clipped to the grid: (position, direction, t0, t1) with empty rays t1 <= t0."""
+    position = (np.asarray(origin, np.float64) - np.asarray(grid.lower, np.float64)) / float(grid.voxel)
+    direction = np.asarray(direction, np.float64)
+    safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    a, b = -position / safe, (np.array(grid.shape) - position) / safe
+    t0 = np.maximum(np.minimum(a, b).max(1), 0.0)
+    t1 = np.minimum(np.maximum(a, b).min(1), np.asarray(t_max, np.float64) / float(grid.voxel))
+    return position, safe, t0, t1
+
+
+def march_straight(
+    materials: Materials, origin: np.ndarray, direction: np.ndarray, t_max: np.ndarray, power: np.ndarray
+) -> Marched:
+    """Through the voxels on straight lines; `power` [n, C] at the origin (what lies outside the grid is vacuum)."""
+    grid = materials.grid
+    position, direction, t0, t1 = to_voxels(grid, origin, direction, t_max)
+    live = np.flatnonzero(t1 > t0)
+    channels = tuple(materials.scattering[c] + materials.absorption[c] for c in range(materials.scattering.shape[0]))
+    flat = tuple(x.reshape(-1) for x in channels)
+    track = tuple(jnp.zeros_like(x) for x in flat)
+    books = _Books(power.shape[1])
+    for first in range(0, len(live), _BATCH):
+        chosen = live[first : first + _BATCH]
+        rays = _enter(grid.shape, position[chosen], direction[chosen], t0[chosen], t1[chosen], power[chosen])
+        books.sent += power[chosen].sum(0, dtype=np.float64)
+        track = _run(lambda r, k, s=flat, g=grid.shape: _straight_round(s, g, r, k), rays, track, books)
+    shape = (len(flat), *grid.shape)
+    return books.result(jnp.stack(track).reshape(shape))
+
+
+def _enter(shape, position, direction, t0, t1, power):
+    """State of rays at their entry points."""
+    at = position + direction * (t0 + 1e-5 * np.minimum(1.0, t1 - t0))[:, None]
+    voxel = np.clip(np.floor(at), 0, np.array(shape) - 1)
+    step = np.where(direction > 0, 1, -1)
+    boundary = voxel + (step > 0)
+    t_next = (boundary - position) / direction
+    t_step = np.abs(1.0 / direction)
+    columns = lambda a, kind: tuple(jnp.asarray(a[:, k], kind) for k in range(3))  # noqa: E731
+    amounts = tuple(jnp.asarray(power[:, c], jnp.float32) for c in range(power.shape[1]))
+    # distances count from the entry, so that float32 resolves them
+    return _Straight(
+        columns(voxel, jnp.int32), columns(t_next - t0[:, None], jnp.float32), columns(t_step, jnp.float32),
+        columns(step, jnp.int32), jnp.zeros(len(t0), jnp.float32), jnp.asarray(t1 - t0, jnp.float32), amounts, amounts,
+    )  # fmt: skip
+
+
+@partial(jax.jit, static_argnames=("shape",), donate_argnums=(3,))
+def _straight_round(extinction, shape, rays, track):
+    def body(_, carry):
+        rays, track = carry
+        x, y, z = rays.voxel
+        at = (x * shape[1] + y) * shape[2] + z
+        nearest = jnp.minimum(jnp.minimum(rays.t_next[0], rays.t_next[1]), rays.t_next[2])
+        stop = jnp.minimum(nearest, rays.t_end)
+        length = jnp.maximum(stop - rays.t, 0.0)
+        power, track = _absorb(extinction, track, rays.power, at, length)
+        crossed = nearest < rays.t_end
+        moves = [(rays.t_next[a] <= nearest) & crossed for a in range(3)]
+        voxel, t_next, outside = [], [], ~crossed
+        for a in range(3):
+            index = rays.voxel[a] + jnp.where(moves[a], rays.step[a], 0)
+            outside = outside | (index < 0) | (index >= shape[a])
+            voxel.append(jnp.clip(index, 0, shape[a] - 1))
+            t_next.append(jnp.where(moves[a], rays.t_next[a] + rays.t_step[a], rays.t_next[a]))
+        t = jnp.where(outside, rays.t_end, jnp.maximum(stop, rays.t))
+        return rays._replace(voxel=tuple(voxel), t_next=tuple(t_next), t=t, power=power), track
+
+    rays, track = lax.fori_loop(0, _ROUND, body, (rays, track))
+    return rays, track, rays.t < rays.t_end
+
+
+def _absorb(extinction, track, power, at, length):
+    """One step of attenuation and deposit in every channel; exact for constant extinction."""
+    new_power, new_track = [], []
+    for sigma, field, amount in zip(extinction, track, power, strict=True):
+        thickness = sigma[at] * length
+        lost = -jnp.expm1(-thickness)
+        thin = thickness < 1e-4
+        mean = jnp.where(thin, 1.0 - 0.5 * thickness, lost / jnp.where(thin, 1.0, thickness))
+        new_track.append(field.at[at].add(amount * mean * length))
+        new_power.append(amount - amount * lost)
+    return tuple(new_power), tuple(new_track)
+
+
+class _Books:
+    """Sums over rays, kept on the host in float64."""
+
+    def __init__(self, num_channels):
+        self.sent, self.live, self.escaped = (np.zeros(num_channels) for _ in range(3))
+        self.num_steps = 0
+
+    def result(self, track):
+        return Marched(track, self.sent, self.live, self.escaped, self.num_steps)
+
+
+def _run(advance, rays, track, books, max_rounds=400):
+    """Rounds of steps until no ray is left, packing the living ones between rounds."""
+    for _ in range(max_rounds):
+        count = _bucket(len(rays.power[0]))
+        rays = jax.tree.map(lambda x, n=count: _pad(x, n), rays)
+        rays, track, moving = advance(rays, track)
+        books.num_steps += count * _ROUND
+        power = np.stack([np.asarray(p) for p in rays.power], 1)
+        start = np.stack([np.asarray(p) for p in rays.start], 1)
+        moving = np.asarray(moving)
+        strong = (power > _WEAKEST * start).any(1)
+        books.escaped += power[~moving].sum(0, dtype=np.float64)
+        books.live += power[moving & ~strong].sum(0, dtype=np.float64)
+        kept = np.flatnonzero(moving & strong)
+        if len(kept) == 0:
+            return track
+        rays = jax.tree.map(lambda x: np.asarray(x)[kept], rays)
+    books.live += np.stack([np.asarray(p) for p in rays.power], 1).sum(0, dtype=np.float64)
+    return track
+
+
+def _bucket(count):
+    """Few array sizes, so that rounds share compilations."""
+    size = 1024
+    while size < count:
+        size *= 2 if size < 1 << 14 else 4
+    return size
+
+
+def _pad(array, count):
+    """Padding rays carry no power and have no way to go."""
+    array = np.asarray(array)
+    return jnp.asarray(np.concatenate([array, np.zeros((count - len(array), *array.shape[1:]), array.dtype)]))
+
+
+def corner_table(*fields: Float[Array, "X Y Z"]) -> Float[Array, "voxels F"]:
+    """Fields side by side, so that one row gather serves them all."""
+    return jnp.stack([f.reshape(-1) for f in fields], axis=1)
+
+
+def interpolate(
+    table: Float[Array, "voxels F"], shape: tuple[int, int, int], position: Float[Array, "n 3"]
+) -> Float[Array, "n F"]:
+    """Trilinear lookup between voxel centres, held constant beyond the outer centres; position in voxel units."""
+    last = jnp.asarray(shape, jnp.float32) - 1.0
+    at = jnp.clip(position - 0.5, 0.0, last)
+    low = jnp.minimum(at.astype(jnp.int32), jnp.maximum(jnp.asarray(shape, jnp.int32) - 2, 0))
+    high = jnp.minimum(low + 1, jnp.asarray(shape, jnp.int32) - 1)
+    fx, fy, fz = ((at - low)[:, a, None] for a in range(3))
+
+    def row(ix, iy):
+        base = (ix * shape[1] + iy) * shape[2]
+        return table[base + low[:, 2]] * (1.0 - fz) + table[base + high[:, 2]] * fz
+
+    near = row(low[:, 0], low[:, 1]) * (1.0 - fy) + row(low[:, 0], high[:, 1]) * fy
+    far = row(high[:, 0], low[:, 1]) * (1.0 - fy) + row(high[:, 0], high[:, 1]) * fy
+    return near * (1.0 - fx) + far * fx
+
+
+def leapfrog_step(
+    lookup, position: Float[Array, "n 3"], momentum: Float[Array, "n 3"], index: Float[Array, "n"], step: float
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n"], Float[Array, "n 3"]]:
+    """Drift, kick, drift over the arc length `step`; returns position, momentum, index there, and the midpoint.
+
+    `lookup(x)` gives [n, 4]: D = grad (n^2/2) and n. The step in tau uses the index of the previous midpoint, which saves
+    a lookup. Momentum keeps its part across D; its part along D is set so that |p| = n at the midpoint's energy; where
+    that is impossible (grazing), p is rescaled.
+    """
+    half = (0.5 * step / index)[:, None]
+    middle = position + half * momentum
+    found = lookup(middle)
+    gradient, n = found[:, :3], found[:, 3]
+    squared = jnp.sum(gradient * gradient, axis=1)
+    bends = squared > 1e-14
+    unit = gradient * lax.rsqrt(jnp.where(bends, squared, 1.0))[:, None]
+    # the energy at the midpoint, |p|^2 = n^2, holds for the momentum halfway through the kick
+    along = jnp.sum(momentum * unit, axis=1)
+    across = momentum - along[:, None] * unit
+    kick = jnp.sqrt(squared) * half[:, 0]
+    target = n * n - jnp.sum(across * across, axis=1)
+    possible = bends & (target > 0)
+    halfway = along + kick
+    fixed = jnp.where(halfway < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(possible, target, 1.0))
+    projected = across + (fixed + kick)[:, None] * unit
+    plain = momentum + 2.0 * half * gradient
+    plain = jnp.where(bends[:, None], plain, momentum * (n * lax.rsqrt(jnp.sum(momentum * momentum, axis=1)))[:, None])
+    momentum = jnp.where(possible[:, None], projected, plain)
+    return middle + half * momentum, momentum, n, middle
+
+
+def euler_step(lookup, position, momentum, index, step):
+    """The paper's eq. 2-3, x += delta v / n and v += delta grad n, first order."""
+    found = lookup(position)
+    n = found[:, 3]
+    middle = position + (0.5 * step / n)[:, None] * momentum
+    moved = position + (step / n)[:, None] * momentum
+    return moved, momentum + (step / n)[:, None] * found[:, :3], n, middle
+
+
+STEPS = {"leapfrog": leapfrog_step, "euler": euler_step}
+
+
+def bent_table(materials: Materials) -> Float[Array, "voxels 4"]:
+    """D and n for `interpolate`."""
+    return corner_table(*materials.gradient, materials.ior)
+
+
+def march_bent(
+    materials: Materials,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    t_max: np.ndarray,
+    power: np.ndarray,
+    *,
+    step: float = 0.5,
+    integrator: Integrator = "leapfrog",
+    seed: int = 0,
+) -> Marched:
+    """Along bent rays, `step` in voxels; the first step of each ray is shortened at random, so that deposits do not beat.
+
+    Rays that an opaque surface cuts before they enter the grid are ended; opaque surfaces inside the grid are not seen.
+    """
+    grid = materials.grid
+    position, direction, t0, t1 = to_voxels(grid, origin, direction, t_max)
+    live = np.flatnonzero(t1 > t0)
+    jitter = np.random.default_rng(seed).random(len(t0)) * step
+    channels = materials.scattering.shape[0]
+    flat = tuple((materials.scattering[c] + materials.absorption[c]).reshape(-1) for c in range(channels))
+    track = tuple(jnp.zeros_like(x) for x in flat)
+    table, books = bent_table(materials), _Books(power.shape[1])
+    for first in range(0, len(live), _BATCH):
+        k = live[first : first + _BATCH]
+        amounts = tuple(jnp.asarray(power[k, c], jnp.float32) for c in range(channels))
+        start = position[k] + direction[k] * (t0[k] + 1e-4 + np.minimum(jitter[k], 0.5 * (t1 - t0)[k]))[:, None]
+        ones = jnp.ones(len(k), jnp.float32)
+        rays = _Bent(jnp.asarray(start, jnp.float32), jnp.asarray(direction[k], jnp.float32), ones, amounts, amounts, ones > 0)
+        books.sent += power[k].sum(0, dtype=np.float64)
+        track = _run(lambda r, tr: _bent_round(flat, table, grid.shape, step, integrator, r, tr), rays, track, books)
+    return books.result(jnp.stack(track).reshape((channels, *grid.shape)))
+
+
+@partial(jax.jit, static_argnames=("shape", "integrator"), donate_argnums=(6,))
+def _bent_round(extinction, table, shape, step, integrator, rays, track):
+    advance = STEPS[integrator]
+    upper = jnp.asarray(shape, jnp.float32)
+
+    def body(_, carry):
+        rays, track = carry
+        index = jnp.maximum(rays.index, 1.0)
+        position, momentum, n, middle = advance(lambda x: interpolate(table, shape, x), rays.position, rays.momentum, index, step)
+        voxel = jnp.clip(middle.astype(jnp.int32), 0, jnp.asarray(shape, jnp.int32) - 1)
+        at = (voxel[:, 0] * shape[1] + voxel[:, 1]) * shape[2] + voxel[:, 2]
+        power, track = _absorb(extinction, track, rays.power, at, jnp.where(rays.inside, step, 0.0))
+        inside = rays.inside & jnp.all((position > 0) & (position < upper), axis=1)
+        keep = rays.inside[:, None]
+        return rays._replace(
+            position=jnp.where(keep, position, rays.position),
+            momentum=jnp.where(keep, momentum, rays.momentum),
+            index=jnp.where(rays.inside, n, rays.index),
+            power=power,
+            inside=inside,
+        ), track
+
+    rays, track = lax.fori_loop(0, _ROUND, body, (rays, track))
+    return rays, track, rays.inside
