@@ -6,10 +6,8 @@ light is the lights' light (virtual AND primary: a path light-x'-x-eye is clampe
 forgets) plus the same residual again.
 """
 
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -68,7 +66,6 @@ class Proposal(NamedTuple):
     gain: Float[Array, "n 3"]  # f_hat / p(direction): sigma_s in the medium, f_r cos / p on a surface
 
 
-@jax.jit
 def propose(
     scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array, "n"], u3: Float[Array, "n"]
 ) -> Proposal:
@@ -93,7 +90,6 @@ def propose(
     return Proposal(origin, direction, gain)
 
 
-@partial(jax.jit, static_argnames=("distance", "transmittance", "num_steps"))
 def new_vertices(
     scene: Scene,
     points: Points,
@@ -167,7 +163,6 @@ def _relative(medium):
     return extinction / jnp.maximum(jnp.mean(extinction), 1e-30)
 
 
-@jax.jit
 def sample_primary(
     scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array, "n"], u3: Float[Array, "n"]
 ) -> tuple[primary.LightSample, Float[Array, "n 3"]]:
@@ -182,7 +177,6 @@ def sample_primary(
     return found, origin
 
 
-@partial(jax.jit, static_argnames=("isotropic", "num_steps"))
 def direct_light(
     scene: Scene,
     points: Points,

@@ -58,6 +58,8 @@ class Vertices(eqx.Module):
     incident: Float[Array, "m 3"]  # L_i: incident radiance weight, per path
     face: Int[Array, "m"]  # -1 = in the medium
     density: Float[Array, "m"]  # of the medium there; 1 on surfaces
+    outgoing: Float[Array, "m 3"]  # of travel, leaving
+    continues: Bool[Array, "m"]  # the walk went on from here
     valid: Bool[Array, "m"]
 
 
@@ -218,6 +220,8 @@ def _interact(scene, walkers, flight, meets, hit, face, u):
         incident=incident,
         face=jnp.where(meets, face, -1),
         density=flight.density,
+        outgoing=direction,
+        continues=alive,
         valid=interacts,
     )
     return Walkers(walkers.path, walkers.bounce + 1, origin, direction, power, alive), vertices
@@ -296,7 +300,7 @@ def trace(
     """
     seed = jnp.uint32(seed)
     number = len(paths)
-    walkers = emit(scene, jnp.asarray(_padded(np.asarray(paths, np.uint32))), seed)
+    walkers = emit(scene, jnp.asarray(padded(np.asarray(paths, np.uint32))), seed)
     alive = np.asarray(walkers.alive) & (np.arange(walkers.path.shape[0]) < number)
     walkers = eqx.tree_at(lambda w: w.alive, walkers, jnp.asarray(alive))
     tracked = scene.mesh is None and scene.medium is not None and scene.medium.density is not None
@@ -310,7 +314,7 @@ def trace(
             walkers, vertices = _walk(scene, state[0], seed, num_steps=_CHUNK)
             state = (walkers,)
         else:
-            t, face = ray_casting.intersect(caster, state[0].origin, state[0].direction)
+            t, face = ray_casting.intersect(caster, state[0].origin, state[0].direction, np.inf)
             walkers, vertices = _step(scene, state[0], t, face, seed)
             state = (walkers,)
         found.append(_rows(vertices, np.asarray(vertices.valid) & (np.asarray(vertices.depth) < max_depth)))
@@ -329,18 +333,18 @@ def _rows(vertices, chosen):
     return jax.tree.map(lambda x: np.asarray(x)[chosen], vertices)
 
 
-def _padded(values):
+def padded(values):
     """`values` with zeros up to a power of four times 64: few sizes, few compilations."""
     size = 64
     while size < len(values):
         size *= 4
-    return np.concatenate([values, np.zeros(size - len(values), values.dtype)])
+    return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
 
 
 def _compact(state, alive):
     """The live lanes, padded with dead ones; `alive` (numpy) may be less than the state's own."""
     lanes = np.flatnonzero(alive)
-    chosen = _padded(lanes)
+    chosen = padded(lanes)
     live = np.arange(len(chosen)) < len(lanes)
     if len(chosen) == len(alive):
         chosen, live = np.arange(len(alive)), alive
@@ -351,9 +355,9 @@ def _compact(state, alive):
 
 def _join(parts):
     if not parts:
-        none = np.zeros((0,), np.int32)
-        empty = np.zeros((0, 3), np.float32)
-        return Vertices(none, none, empty, empty, empty, none, np.zeros((0,), np.float32), np.zeros((0,), bool))
+        index, vector = np.zeros((0,), np.int32), np.zeros((0, 3), np.float32)
+        flag = np.zeros((0,), bool)
+        return Vertices(index, index, vector, vector, vector, index, np.zeros((0,), np.float32), vector, flag, flag)
     joined = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     order = np.lexsort((joined.depth, joined.path))
     return jax.tree.map(lambda x: x[order], joined)

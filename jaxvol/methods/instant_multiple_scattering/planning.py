@@ -36,6 +36,7 @@ class Plan:
     pair_steps: int
     mip_block: int
     upsample: int
+    refine_below: float
     tile: int
     jitter: bool
     caster: str
@@ -51,7 +52,7 @@ CHOICES = {
     "end": ("clamped", "unclamped", "reduced"),
     "distance": ("weight", "exponential"),
     "transmittance": ("true", "local"),
-    "visibility": ("rays", "maps", "none"),
+    "visibility": ("rays", "none"),
     "sampling": ("equiangular", "stratified"),
     "specialize": ("values", "structure"),
 }
@@ -78,7 +79,7 @@ def plan(
     mean_free_paths: float | None = 0.5,
     num_levels: int = 3,
     num_chains: int = 1,
-    light_stride: int = 2,
+    light_stride: int = 4,
     end: str = "clamped",
     distance: str = "weight",
     transmittance: str = "true",
@@ -91,6 +92,7 @@ def plan(
     pair_steps: int | None = None,
     mip_block: int = 4,
     upsample: int = 1,
+    refine_below: float = 0.25,
     tile: int = 8192,
     jitter: bool = True,
     caster: str = "auto",
@@ -101,15 +103,16 @@ def plan(
     num_paths: light paths of a set; num_sets: independent sets that are averaged (two or more give a variance).
     mean_free_paths: clamp distance d = mean_free_paths / local sigma_t, at most a tenth of the scene (None: unclamped).
     num_levels: compensation steps; 0 = clamped only (biased). num_chains: new vertices per receiver on the first step.
-    light_stride: the vertices of step k gather from one of min(16, stride^k) lights, chosen afresh.
+    light_stride: new vertices gather from one of `light_stride` lights, another share each time.
     end: what happens beyond the last step: "clamped" (loses about (1/3)^(num_levels + 1) of the energy), "unclamped"
     (unbiased, infinite variance), "reduced" (bound times 16).
     distance: "weight" or the paper's "exponential"; transmittance to new vertices: "true" or "local" (biased);
-    visibility of new vertices: "rays", "maps" (depth map of the nearest light; biased) or "none" (biased).
+    visibility of new vertices: "rays" or "none" (biased near surfaces).
     direct_at_vertex: False leaves out the primary lights there, as the paper's text does (biased).
     sampling: "equiangular", or "stratified" with num_evaluations points per light (the paper).
     group_size: where pairs are costly, one light of so many is marched to and tested for occlusion.
-    upsample: evaluate at 1/upsample^2 of the pixels and reconstruct (biased where it interpolates).
+    upsample: evaluate at 1/upsample^2 of the pixels and reconstruct (biased where it interpolates); pixels whose
+    neighbours weigh less than refine_below are evaluated too.
     specialize: "structure" looks at no values (for gradients).
     Raises ValueError for a medium with a boundary, inclusions or a refractive index, and for values out of range.
     """
@@ -163,6 +166,7 @@ def plan(
         pair_steps=16 if pair_steps is None else pair_steps,
         mip_block=mip_block,
         upsample=upsample,
+        refine_below=refine_below,
         tile=tile,
         jitter=jitter,
         caster=caster,

@@ -1,5 +1,6 @@
 """Eye rays in, layers out: sets of lights, tiles of pixels, averages and variances over the sets."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Array, Float, UInt
 
 from jaxvol import camera as pinhole
 from jaxvol import layers, materials, media, ray_casting, sampling
-from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, stages, virtual_lights
+from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, stages, upsampling, virtual_lights
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.methods.instant_multiple_scattering.stages import Context
@@ -21,22 +22,24 @@ NAMES = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for befo
 
 
 def trace_lights(
-    scene: Scene, caster: ray_casting.Caster, plan: Plan, *, seed: int
+    scene: Scene, caster: ray_casting.Caster, plan: Plan, *, seed: int, sizes: dict[str, int] | None = None
 ) -> tuple[LightSet, dict[str, int]]:
-    """One set of virtual lights and the counts of its paths."""
+    """One set of virtual lights and the counts of its paths; for `sizes` see `virtual_lights`."""
     vertices, counts = light_paths.trace(
         scene, caster, seed=seed, paths=np.arange(plan.num_paths), max_depth=plan.max_depth
     )
-    found = virtual_lights.virtual_lights(scene, vertices, num_paths=plan.num_paths)
+    found = virtual_lights.virtual_lights(scene, vertices, num_paths=plan.num_paths, sizes=sizes)
     return found, {**counts, "num_lights": len(vertices.path)}
 
 
-def make_context(scene: Scene, plan: Plan, *, seed: int, lights: LightSet | None = None) -> tuple[Context, dict[str, int]]:
+def make_context(
+    scene: Scene, plan: Plan, *, seed: int, lights: LightSet | None = None, sizes: dict[str, int] | None = None
+) -> tuple[Context, dict[str, int]]:
     """Trace a set of lights (or take the one given) and prepare what the gathering stages share."""
     caster = ray_casting.caster_for(scene.mesh, kind=plan.caster)
     counts: dict[str, int] = {}
     if lights is None:
-        lights, counts = trace_lights(scene, caster, plan, seed=seed)
+        lights, counts = trace_lights(scene, caster, plan, seed=seed, sizes=sizes)
     medium = scene.medium
     mip = None
     if medium is not None and medium.density is not None:
@@ -114,15 +117,8 @@ def _surface(context, origin, direction, t, face, index):
     points = Points(hit.position, -direction, nothing, clamp, hit.valid, hit.normal, surface)
     u = sampling.uniforms(context.seed, _PIXEL, index, 3)[0]
     gathered = _scaled(stages.gather_points(context, points, u, stride=1, offset=0), tau)
-    number = context.plan.num_chains
     residual = _chains(context, lambda chain: (points, tau), index + jnp.uint32(0x40000000))
-    del number
     return {name: gathered[name] + residual[name] for name in gathered}
-
-
-def _tiles(total, size):
-    for start in range(0, total, size):
-        yield start, min(start + size, total)
 
 
 def render_set(
@@ -132,37 +128,96 @@ def render_set(
     *,
     seed: int,
     lights: LightSet | None = None,
+    sizes: dict[str, int] | None = None,
 ) -> tuple[dict[str, Float[np.ndarray, "HW 3"]], dict[str, int]]:
-    """All pixels lit by one set of virtual lights: layers by name (numpy), and counts."""
+    """All pixels lit by one set of virtual lights: layers by name (numpy), and counts. Updates `sizes`."""
     number = camera.height * camera.width
     result = {name: np.zeros((number, 3), np.float32) for name in NAMES}
     if not (plan.volume or plan.surface):
         return result, {"num_truncated": 0, "num_lights": 0}
-    context, counts = make_context(scene, plan, seed=seed, lights=lights)
-    index = np.arange(number, dtype=np.uint32)
-    for begin, end in _tiles(number, plan.tile):
-        picked = np.full(min(plan.tile, number), end - 1, np.uint32)
-        picked[: end - begin] = index[begin:end]
-        values = gather_rays(context, *eye_rays(context, camera, jnp.asarray(picked)))
+    context, counts = make_context(scene, plan, seed=seed, lights=lights, sizes=sizes)
+    if sizes is not None:
+        sizes.update(virtual_lights.sizes(context.lights))
+    if plan.upsample == 1:
+        _evaluate(context, camera, np.arange(number, dtype=np.uint32), result)
+        return result, counts
+    return _from_low_resolution(context, camera, result, counts)
+
+
+def _evaluate(context, camera, index, result):
+    """All layers at the pixels `index`, tile by tile, into `result`."""
+    size = min(context.plan.tile, light_paths.padded(index).size)
+    for begin in range(0, len(index), size):
+        chosen = index[begin : begin + size]
+        lanes = np.full(size, chosen[-1], np.uint32)
+        lanes[: len(chosen)] = chosen
+        values = gather_rays(context, *eye_rays(context, camera, jnp.asarray(lanes)))
         for name in NAMES:
-            result[name][begin:end] = np.asarray(values[name])[: end - begin]
-    return result, counts
+            result[name][chosen] = np.asarray(values[name])[: len(chosen)]
 
 
-def eye_rays(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple:
-    """Origins, directions, first hits (t, face) of the eye rays through pixels, and the pixels' numbers."""
-    index = jnp.asarray(index)
-    xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
-    inside = jnp.float32(0.5)
-    if context.plan.jitter:
-        inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
-    rays = pinhole.generate_rays(camera, xy + inside)
+def _from_low_resolution(context, camera, result, counts):
+    """Every upsample-th pixel each way, bilateral reconstruction, and the pixels where no neighbour resembles."""
+    plan = context.plan
+    factor, number = plan.upsample, camera.height * camera.width
+    rows, columns = -(-camera.height // factor), -(-camera.width // factor)
+    rays = _block_rays(context, camera, rows, columns, factor)
+    shape = (rows * columns, 3)
+    coarse = {name: np.zeros(shape, np.float32) for name in NAMES}
+    for begin in range(0, shape[0], plan.tile):
+        part = tuple(x[begin : begin + plan.tile] for x in rays)
+        values = gather_rays(context, *part)
+        for name in NAMES:
+            coarse[name][begin : begin + plan.tile] = np.asarray(values[name])
+    steps = max(plan.eye_steps // 2, 1)
+    low_guides = upsampling.guides(context.scene, *rays[:4], num_steps=steps)
+    centers = eye_rays(_without_jitter(context), camera, jnp.arange(number, dtype=jnp.uint32))
+    full_guides = upsampling.guides(context.scene, *centers[:4], num_steps=steps)
+    built, weight = upsampling.reconstruct(
+        coarse, low_guides, full_guides, height=camera.height, width=camera.width, factor=factor
+    )
+    for name in NAMES:
+        result[name][:] = np.asarray(built[name])
+    seen = np.asarray(full_guides.inside | full_guides.hits)
+    again = np.flatnonzero((np.asarray(weight) < plan.refine_below) & seen).astype(np.uint32)
+    if len(again):
+        _evaluate(_without_jitter(context), camera, again, result)
+    return result, {**counts, "num_refined": len(again), "num_evaluated": len(again) + shape[0]}
+
+
+def _without_jitter(context):
+    return context._replace(plan=dataclasses.replace(context.plan, jitter=False))
+
+
+def _block_rays(context, camera, rows, columns, factor):
+    """Eye rays through the middle of blocks of factor x factor pixels (clamped to the picture)."""
+    index = jnp.arange(rows * columns, dtype=jnp.uint32)
+    xy = (jnp.stack([index % columns, index // columns], axis=-1).astype(jnp.float32) + 0.5) * factor
+    xy = jnp.minimum(xy, jnp.asarray([camera.width - 0.5, camera.height - 0.5]))
+    return cast(context, camera, xy, index)
+
+
+def _jittered(context, index):
+    return jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
+
+
+def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"]) -> tuple:
+    """Origins, directions, first hits (t, face) of the eye rays through `xy`, and the given numbers."""
+    rays = pinhole.generate_rays(camera, xy)
     t = jnp.full(index.shape, jnp.inf, jnp.float32)
     face = jnp.full(index.shape, -1, jnp.int32)
     if context.scene.mesh is not None:
         t, face = ray_casting.intersect(context.caster, rays.origin, rays.direction, t)
         t, face = jnp.asarray(t), jnp.asarray(face)
     return rays.origin, rays.direction, t, face, index
+
+
+def eye_rays(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple:
+    """Origins, directions, first hits (t, face) of the eye rays through pixels, and the pixels' numbers."""
+    index = jnp.asarray(index)
+    xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
+    inside = _jittered(context, index) if context.plan.jitter else jnp.float32(0.5)
+    return cast(context, camera, xy + inside, index)
 
 
 def render(
@@ -175,18 +230,19 @@ def render(
 ) -> Estimate:
     """The six layers, the mean over `plan.num_sets` independent sets of lights, and its variance when there are several.
 
-    Diagnostics: "num_truncated" light paths that were cut at max_depth, "num_lights" virtual lights of all sets.
+    Diagnostics: "num_truncated" light paths that were cut at max_depth, "num_lights" virtual lights of all sets; with
+    upsampling "num_evaluated" and "num_refined" pixels.
     """
     total = {name: 0.0 for name in NAMES}
     squares = {name: 0.0 for name in NAMES}
-    counts = {"num_truncated": 0, "num_lights": 0}
+    counts: dict[str, int] = {}
+    sizes: dict[str, int] | None = {} if plan.num_sets > 1 else None
     for k in range(plan.num_sets):
-        images, found = render_set(scene, camera, plan, seed=seed * 65537 + k)
+        images, found = render_set(scene, camera, plan, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes)
         for name in NAMES:
             total[name] = total[name] + images[name].astype(np.float64)
             squares[name] = squares[name] + np.square(images[name].astype(np.float64))
-        for name in counts:
-            counts[name] += found.get(name, 0)
+        counts = {name: counts.get(name, 0) + value for name, value in found.items()}
         if on_progress is not None:
             on_progress((k + 1) / plan.num_sets)
     number = plan.num_sets

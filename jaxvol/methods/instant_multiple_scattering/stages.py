@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, UInt
 
 from jaxvol import media, ray_casting, sampling
@@ -209,56 +210,86 @@ def compensate(
     """The residual of clamping at points (section 4.3), through `num_levels` new vertices one after the other."""
     plan, scene = context.plan, context.scene
     sums = zero_sums(index.shape[0])
+    lit = plan.direct_at_vertex and primary.num_lights(scene) > 0
     for level in range(plan.num_levels):
-        dimension = 8 * (chain * plan.num_levels + level)
-        u = sum((sampling.uniforms(context.seed, _CHAIN, index, dimension + i) for i in range(4)), ())
-        proposal = compensation.propose(scene, points, u[0], u[1], u[2])
+        u = _chain_uniforms(context.seed, index, jnp.int32(chain * plan.num_levels + level))
+        proposal = _propose(scene, points, u)
         s, face = _surface_within(context, points, proposal)
-        sigma = compensation.local_sigma(scene.medium, context.mip, points.position)
-        steps = max(4, plan.pair_steps // 4)
-        points, gain = compensation.new_vertices(
-            scene,
-            points,
-            proposal,
-            s,
-            face,
-            u[3],
-            u[4],
-            sigma,
-            distance=plan.distance,
-            transmittance=plan.transmittance,
-            num_steps=steps,
+        points, throughput, sample, origin = _advance(
+            scene, context.mip, points, proposal, throughput, s, face, u, plan=plan, lit=lit
         )
-        throughput = throughput * gain
-        clamp = clamp_at(scene, context.mip, points.position, plan=plan)
-        last = level == plan.num_levels - 1
-        gathered = clamp
-        if last and plan.end != "clamped":
-            gathered = None if plan.end == "unclamped" else _REDUCED * clamp
-        points = with_clamp(points, gathered)
-        stride = min(16, plan.light_stride ** (level + 1))
-        offset = int(sampling.uniforms(context.seed, _CHAIN, jnp.uint32(chain), jnp.uint32(level), 7)[0] * stride)
-        found = gather_points(context, points, u[5], stride=stride, offset=offset)
-        total = found["surface"] + found["volume"] + found["multiple"]
-        sums["multiple"] = sums["multiple"] + throughput * total
-        if plan.direct_at_vertex:
-            direct = _direct(context, points, (u[6], u[7], u[8]))
-            add_direct(sums, points, throughput * direct, first=level == 0)
-        points = with_clamp(points, clamp)
+        found = _gather_at_end(context, points, u[5], chain, level)
+        if lit:
+            visible = None
+            if scene.mesh is not None:
+                short = sample.distance * (1.0 - 1e-4)
+                visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
+            direct = _direct(scene, points, sample, visible, plan=plan)
+        else:
+            direct = jnp.zeros_like(throughput)
+        sums = _book(sums, found, points, throughput, direct, jnp.bool_(level == 0))
     return sums
 
 
-def add_direct(sums: Sums, points: Points, value: Float[Array, "n 3"], *, first: bool) -> None:
-    """Book light that came straight from a primary light to a new vertex, by what the vertex is."""
-    if not first:
-        sums["multiple"] = sums["multiple"] + value
-        return
-    if points.on_surface is None:
-        sums["volume"] = sums["volume"] + value
-        return
-    on = points.on_surface[:, None]
-    sums["surface"] = sums["surface"] + jnp.where(on, value, 0.0)
-    sums["volume"] = sums["volume"] + jnp.where(on, 0.0, value)
+def _gather_at_end(context, points, u, chain, level):
+    """Light of a random share of the virtual lights at new vertices; the last ones may be clamped less."""
+    plan = context.plan
+    if level == plan.num_levels - 1 and plan.end != "clamped":
+        points = with_clamp(points, None if plan.end == "unclamped" else _REDUCED * points.clamp)
+    choice = np.random.default_rng([context.seed & 0xFFFFFFFF, chain, level])
+    offset = int(choice.integers(plan.light_stride))
+    return gather_points(context, points, u, stride=plan.light_stride, offset=offset)
+
+
+@jax.jit
+def _chain_uniforms(seed, index, dimension):
+    return sum((sampling.uniforms(seed, _CHAIN, index, 4 * dimension + i) for i in range(3)), ())
+
+
+@jax.jit
+def _propose(scene, points, u):
+    return compensation.propose(scene, points, u[0], u[1], u[2])
+
+
+@partial(jax.jit, static_argnames=("plan", "lit"))
+def _advance(scene, mip, points, proposal, throughput, s, face, u, *, plan, lit):
+    """New vertices with their clamp distance, the throughput to them, and a direction to a primary light."""
+    sigma = compensation.local_sigma(scene.medium, mip, points.position)
+    found, gain = compensation.new_vertices(
+        scene,
+        points,
+        proposal,
+        s,
+        face,
+        u[3],
+        u[4],
+        sigma,
+        distance=plan.distance,
+        transmittance=plan.transmittance,
+        num_steps=max(4, plan.pair_steps // 4),
+    )
+    found = with_clamp(found, clamp_at(scene, mip, found.position, plan=plan))
+    sample, origin = compensation.sample_primary(scene, found, u[6], u[7], u[8]) if lit else (None, None)
+    return found, throughput * gain, sample, origin
+
+
+@partial(jax.jit, static_argnames="plan")
+def _direct(scene, points, sample, visible, *, plan):
+    steps = max(plan.pair_steps, plan.eye_steps)
+    return compensation.direct_light(scene, points, sample, visible, isotropic=plan.isotropic, num_steps=steps)
+
+
+@jax.jit
+def _book(sums, found, points, throughput, direct, first):
+    """Add what new vertices send on: virtual lights to "multiple", primary light by what the first vertex is."""
+    value = throughput * direct
+    total = found["surface"] + found["volume"] + found["multiple"]
+    on = jnp.zeros((1, 1), bool) if points.on_surface is None else points.on_surface[:, None]
+    return {
+        "surface": sums["surface"] + jnp.where(first & on, value, 0.0),
+        "volume": sums["volume"] + jnp.where(first & ~on, value, 0.0),
+        "multiple": sums["multiple"] + throughput * total + jnp.where(first, 0.0, value),
+    }
 
 
 def with_clamp(points: Points, clamp: Float[Array, "n"] | None) -> Points:
@@ -280,16 +311,3 @@ def _surface_within(context, points, proposal):
     if context.scene.mesh is None or context.plan.visibility == "none":
         return jnp.full(n, jnp.inf, jnp.float32), jnp.full(n, -1, jnp.int32)
     return ray_casting.intersect(context.caster, proposal.origin, proposal.direction, points.clamp)
-
-
-def _direct(context, points, u):
-    scene, plan = context.scene, context.plan
-    if primary.num_lights(scene) == 0:
-        return jnp.zeros_like(points.position)
-    sample, origin = compensation.sample_primary(scene, points, *u)
-    visible = None
-    if scene.mesh is not None:
-        short = sample.distance * (1.0 - 1e-4)
-        visible = ~jnp.asarray(ray_casting.occluded(context.caster, origin, sample.direction, short))
-    steps = max(plan.pair_steps, plan.eye_steps)
-    return compensation.direct_light(scene, points, sample, visible, isotropic=plan.isotropic, num_steps=steps)

@@ -55,16 +55,14 @@ def _pad(values, size, filler=0.0):
     return jnp.asarray(padded)
 
 
-def _in_medium(medium, vertices, num_paths):
-    size = capacity(len(vertices.path))
+def _in_medium(medium, vertices, num_paths, size):
     strength = vertices.incident * vertices.density[:, None] * (np.asarray(medium.sigma_s) / num_paths)
     # Padding has a unit-sized direction, so that phase functions of it stay finite.
     direction = _pad(vertices.direction, size, 3.0**-0.5)
     return VirtualLights(_pad(vertices.position, size), direction, _pad(strength, size))
 
 
-def _on_surface(mesh, vertices, num_paths):
-    size = capacity(len(vertices.path))
+def _on_surface(mesh, vertices, num_paths, size):
     face, direction = vertices.face, vertices.direction
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -84,8 +82,13 @@ def _on_surface(mesh, vertices, num_paths):
     )
 
 
-def virtual_lights(scene: Scene, vertices: Vertices, *, num_paths: int) -> LightSet:
-    """Turn path vertices (numpy) into sets of lights; `num_paths` counts ALL emitted paths, also those that missed."""
+def virtual_lights(
+    scene: Scene, vertices: Vertices, *, num_paths: int, sizes: dict[str, int] | None = None
+) -> LightSet:
+    """Turn path vertices (numpy) into sets of lights; `num_paths` counts ALL emitted paths, also those that missed.
+
+    `sizes` are array sizes to keep where they suffice, so that the next set of lights needs no compilation.
+    """
     first = vertices.depth == 0
     surface = vertices.face >= 0
     chosen = {
@@ -97,18 +100,26 @@ def virtual_lights(scene: Scene, vertices: Vertices, *, num_paths: int) -> Light
     found = {}
     for name, rows in chosen.items():
         part = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows & vertices.valid], vertices)
-        if len(part.path) == 0:
+        count, size = len(part.path), (sizes or {}).get(name, 0)
+        if count > size:
+            size = capacity(count) if sizes is None else capacity(count + count // 8)
+        if size == 0:
             found[name] = None
         elif name.startswith("surface"):
-            found[name] = _on_surface(scene.mesh, part, num_paths)
+            found[name] = _on_surface(scene.mesh, part, num_paths, size)
         else:
-            found[name] = _in_medium(scene.medium, part, num_paths)
+            found[name] = _in_medium(scene.medium, part, num_paths, size)
     return LightSet(**found)
 
 
 def blocks(lights: LightSet) -> list[tuple[str, VirtualLights]]:
     """Name and lights of every kind that exists."""
     return [(name, getattr(lights, name)) for name in BLOCKS if getattr(lights, name) is not None]
+
+
+def sizes(lights: LightSet) -> dict[str, int]:
+    """Array size of every kind, for the next call of `virtual_lights`."""
+    return {name: block.position.shape[0] for name, block in blocks(lights)}
 
 
 def num_lights(lights: LightSet) -> int:
