@@ -16,6 +16,7 @@ from jaxvol import scene_values as values
 from jaxvol.layers import canonical_sum
 
 MAX_PIXELS_A_SIDE = 16384
+MAX_PIXELS = 2**25  # 4096 x 8192; all layers with their variances then take about 7 GB
 
 
 def method_names() -> tuple[str, ...]:
@@ -59,6 +60,14 @@ class CameraTable(Table):
     fov_y: values.number(low=0.01, high=179.0, unit=" degrees") = 40.0  # full vertical angle
     width: values.integer(low=1, high=MAX_PIXELS_A_SIDE) = 512
     height: values.integer(low=1, high=MAX_PIXELS_A_SIDE) = 512
+
+    @model_validator(mode="after")
+    def _fits_memory(self) -> "CameraTable":
+        pixels = self.width * self.height
+        if pixels > MAX_PIXELS:
+            message = "width * height = {pixels} must be at most {most}"
+            raise PydanticCustomError("value", message, {"pixels": pixels, "most": MAX_PIXELS})
+        return self
 
 
 class TransformTable(Table):

@@ -131,6 +131,7 @@ def test_anisotropy_out_of_range(g):
         ({"camera": CAMERA | {"width": 0}}, ("camera.width = 0", "[1, 16384]")),
         ({"camera": CAMERA | {"height": 10**9}}, ("camera.height = 1000000000", "[1, 16384]")),
         ({"camera": CAMERA | {"height": -3}}, ("camera.height",)),
+        ({"camera": CAMERA | {"width": 16384, "height": 16384}}, ("camera: width * height = 268435456", "33554432")),
         ({"camera": CAMERA | {"width": 1.5}}, ("camera.width", "whole number")),
         ({"camera": CAMERA | {"fov_y": 180}}, ("camera.fov_y = 180", "degrees")),
         ({"camera": CAMERA | {"target": CAMERA["origin"]}}, ("camera.target", "differ from camera.origin")),

@@ -44,7 +44,7 @@ def test_commands_files_and_methods_exist(root, readme):
 @pytest.mark.slow
 def test_the_python_example_runs(readme, tmp_path, monkeypatch, root):
     code = block(readme, "python")
-    assert len(code.strip().splitlines()) <= 8
+    assert len(code.strip().splitlines()) == 5
     code = code.replace('"experiments/', f'"{root}/experiments/').replace("=128", "=32").replace("samples=16", "samples=2")
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
