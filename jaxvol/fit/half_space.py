@@ -18,6 +18,11 @@ from jaxvol import airlight, harmonics
 NUM_STREAMS = 48  # directions per hemisphere; |g| = 0.9 needs 96
 
 
+def streams_for(moments: np.ndarray) -> int:
+    """Directions that resolve a phase function: as many as it has moments, between 48 and 128."""
+    return int(np.clip(np.size(moments), NUM_STREAMS, 128))
+
+
 def _directions(num: int) -> tuple[np.ndarray, np.ndarray]:
     """mu on (0, 1) and weights: Gauss-Legendre in sqrt(mu), because radiance near the horizon goes like mu ln mu."""
     x, weight = leggauss(num)
@@ -84,6 +89,8 @@ def directional_table(
     if not abs(albedo) < 1:
         raise ValueError(f"albedo = {albedo} must lie in [0, 1)")
     rate, source, _ = source_function(albedo, moments, num_streams=num_streams)
+    if not isinstance(albedo, complex):
+        rate, source = rate.real, source.real
     x, _, weight = airlight.double_exponential(num_nodes)
     mu, weight = np.concatenate([x, -x]), np.concatenate([weight, weight])
     source_at = legvander(mu, source.shape[0] - 1) @ source
@@ -91,7 +98,7 @@ def directional_table(
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         radiance = np.einsum("tmr,mr->tm", _gather(tau, rate, mu), source_at)
     table = radiance @ zonal
-    return table if isinstance(albedo, complex) else table.real
+    return table
 
 
 def bounce_tables(

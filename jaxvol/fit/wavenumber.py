@@ -24,6 +24,7 @@ from math import pi, sqrt
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
+from scipy.special import spherical_jn
 
 MAX_MOMENTS = 256
 _TAIL = 900  # levels of the backward continued fraction; enough for |k| < 50
@@ -111,30 +112,35 @@ def _amplitudes(k, m, moments, albedo, source_bands, order, first, last) -> np.n
     return amplitudes
 
 
-def diffusion_root(moments: np.ndarray, albedo: float) -> float:
-    """kappa_0: the smallest kappa in (0, 1] at which the transport operator at k = i kappa is singular (m = 0); 1 if none."""
-    bands = moments.size
-    tail_start = np.ones(1)
+def diffusion_roots(moments: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """kappa_0 of many media at once; `moments` `[*batch, J]`, `albedo` `[*batch]`. See `diffusion_root`."""
+    moments, albedo = np.asarray(moments, dtype=np.float64), np.asarray(albedo, dtype=np.float64)
+    bands = moments.shape[-1]
 
-    def definite(kappa: float) -> bool:
+    def definite(kappa: np.ndarray) -> np.ndarray:  # all pivots positive, from the highest band down
         square = kappa * kappa
-        value = 2 / (1 + np.sqrt(1 - square)) * tail_start[0]
+        value = 2 / (1 + np.sqrt(1 - square))
         for band in range(bands + _TAIL, bands, -1):
             value = 1 / (1 - square * _coupling(band, 0) * value)
-        for band in range(bands, 0, -1):
-            pivot = 1 - albedo * (moments[band] if band < bands else 0) - square * _coupling(band + 1, 0) * value
-            if pivot <= 0:
-                return False
-            value = 1 / pivot
-        return 1 - albedo * moments[0] - square * _coupling(1, 0) * value > 0
+        positive = np.full(kappa.shape, True)
+        for band in range(bands - 1, -1, -1):
+            pivot = 1 - albedo * moments[..., band] - square * _coupling(band + 1, 0) * value
+            positive &= pivot > 0
+            value = 1 / np.where(positive, pivot, 1)
+        return positive
 
-    low, high = 0.0, 1.0 - 1e-12
-    if definite(high):
-        return 1.0
-    while high - low > 1e-13 * high:
+    low, high = np.zeros(albedo.shape), np.full(albedo.shape, 1 - 1e-12)
+    none = definite(high)
+    for _ in range(48):
         middle = (low + high) / 2
-        low, high = (middle, high) if definite(middle) else (low, middle)
-    return low
+        inside = definite(middle)
+        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+    return np.where(none, 1.0, low)
+
+
+def diffusion_root(moments: np.ndarray, albedo: float) -> float:
+    """kappa_0: the smallest kappa in (0, 1] at which the transport operator at k = i kappa is singular (m = 0); 1 if none."""
+    return float(diffusion_roots(np.asarray(moments)[None], np.array([albedo]))[0])
 
 
 def _wigner(degree: int, beta: np.ndarray) -> np.ndarray:
@@ -191,8 +197,8 @@ def _paths(tau: np.ndarray, kappa: float):
     """Groups of radii with their integration paths: (indices, k, weights, is_real).
 
     Radii above 4: from i a upward at 45 degrees, a just below the lowest singularity, so that e^{-a r} is factored out.
-    Smaller radii: along the real axis to k1 = about 16 / r with j_L, then straight up with h_L, which decays there.
-    The real axis is shared by dyadic steps of k1; its nodes below k1 resolve the pole at i kappa.
+    Smaller radii: along the real axis to k1, a power of 4 near 16 / r, with j_L, then straight up with h_L, which decays
+    there. All radii share the real axis; its nodes below k1 resolve the pole at i kappa.
     """
     groups = []
     far = np.flatnonzero(tau > 4)
@@ -204,8 +210,8 @@ def _paths(tau: np.ndarray, kappa: float):
         slope = np.exp(0.25j * pi)
         groups.append((far, 1j * 0.8 * kappa + slope * t, slope * weight))
     near = np.flatnonzero(tau <= 4)
-    exponent = np.round(np.log2(16 / tau[near])).astype(int)
-    t, t_weight = _panels(np.array([0.0, 1, 3, 8, 18, 40]), 16)
+    exponent = 2 * np.round(np.log2(16 / tau[near]) / 2).astype(int)
+    t, t_weight = _panels(np.array([0.0, 1, 3, 8, 18, 40]), 14)
     for step in np.unique(exponent):
         radii = near[exponent == step]
         corner, scale = 2.0**step, 2.0**step / 16
@@ -229,12 +235,14 @@ def moment_responses(
     order: int = 11,
     first: int = 2,
     last: int | None = None,
+    kappa: float | None = None,
 ) -> np.ndarray:
     """R_{l k' m}(tau) / albedo^first: response of receiver band l to source emission y_{k'm}, `[T, order, sources, M]`.
 
     Bounces first..last (n = number of scatterings), last = None for the infinite sum; sigma_t = 1. Bands l describe the
     incident radiance as a function of the direction toward the light, axis receiver -> source; sources emit y_{k'm} about the
     axis source -> receiver; m >= 0, M = max m + 1; both frames share x. albedo in [0, 1), or <= 1 where last is given.
+    kappa = the infinite sum's `diffusion_root` where the caller knows it already.
     """
     tau = np.atleast_1d(np.asarray(tau, dtype=np.float64))
     if not np.all(tau > 0):
@@ -244,7 +252,10 @@ def moment_responses(
     if not 0 <= albedo < 1 and not (albedo == 1 and last is not None):
         raise ValueError(f"albedo = {albedo} must lie in [0, 1) for the infinite sum, [0, 1] for single bounces")
     moments = np.asarray(moments, dtype=np.float64)
-    kappa = 1.0 if last is not None or albedo == 0 else diffusion_root(moments, albedo)
+    if last is not None or albedo == 0:
+        kappa = 1.0  # single bounces have no poles
+    elif kappa is None:
+        kappa = diffusion_root(moments, albedo)
     groups, near, (real, real_weight), limits = _paths(tau, kappa)
     weights = _weights(order, source_bands)
     num_azimuthal = min(order - 1, max(source_bands)) + 1
@@ -268,8 +279,6 @@ def moment_responses(
 
     max_rank = order - 1 + max(source_bands)
     if near.size:
-        from scipy.special import spherical_jn
-
         part = slice(0, real.size)
         wave = [spherical_jn(rank, np.outer(tau[near], real)) for rank in range(max_rank + 1)]
         add(near, wave, part, real_weight, real < limits[:, None])
@@ -282,8 +291,15 @@ def moment_responses(
 
 
 def point_table(
-    tau, *, moments: np.ndarray, albedo: float, order: int = 11, first: int = 2, last: int | None = None
+    tau,
+    *,
+    moments: np.ndarray,
+    albedo: float,
+    order: int = 11,
+    first: int = 2,
+    last: int | None = None,
+    kappa: float | None = None,
 ) -> np.ndarray:
     """L_l(tau) / albedo^first of a point source of intensity 1, bounces first..last: `[T, order]`, sigma_t = 1."""
-    response = moment_responses(tau, moments=moments, albedo=albedo, order=order, first=first, last=last)
+    response = moment_responses(tau, moments=moments, albedo=albedo, order=order, first=first, last=last, kappa=kappa)
     return sqrt(4 * pi) * response[:, :, 0, 0]
