@@ -93,14 +93,9 @@ def march(
     t1: Float[Array, "R"],
     *,
     num_steps: int,
-    crossings: Float[Array, "C R"] | None = None,
     shift=0.5,
 ) -> Marched:
-    """Density in the middle (or at the fraction `shift`) of `num_steps` equal steps of [t0, t1].
-
-    `crossings` are the distances at which a ray crosses the medium's `boundary`, counted from OUTSIDE it (a ray that
-    starts inside has its first crossing at 0); pad with inf. One row gather a step.
-    """
+    """Density in the middle (or at the fraction `shift`) of `num_steps` equal steps of [t0, t1]. One row gather a step."""
     step = jnp.maximum(t1 - t0, 0.0) / num_steps
     packed = None if medium.density is None else media.pack_corners(medium.density)
 
@@ -111,9 +106,6 @@ def march(
             density = media.inside_box(medium.bounds, points).astype(jnp.float32)
         else:
             density = media.density_packed(packed, medium.density.shape, medium.bounds, points)
-        if crossings is not None:
-            inside = jnp.sum((crossings <= t).astype(jnp.int32), axis=0) % 2
-            density = density * inside
         return None, jnp.where(step > 0, density, 0.0)
 
     _, density = lax.scan(body, None, jnp.arange(num_steps, dtype=jnp.float32))
@@ -171,26 +163,23 @@ def interval_map(
     grey: bool = False,
     u: Float[Array, "R"] | None = None,
     u_step: Float[Array, "R"] | None = None,
-    crossings: Float[Array, "C R"] | None = None,
 ) -> IntervalMap:
     """The map in one pass over [t0, t1] (clipped to the medium's bounds here), exact weights (specification 2.2).
 
-    Without a grid and a `boundary` no march at all: t = t0 - log1p(-s omt)/sigma. `grey` says that sigma_t is equal in
+    Without a grid no march at all: t = t0 - log1p(-s omt)/sigma. `grey` says that sigma_t is equal in
     all channels. `u` jitters the levels (position 'jittered'), `u_step` the place of the density samples in their steps
-    (the paper's second jitter). The medium's inclusions are the business of `interval_map_of_steps`.
+    (the paper's second jitter). One medium in its box: boundaries and inclusions go through `interval_map_of_steps`.
     """
     enter, leave = media.box_interval(medium.bounds, origin, direction)
     t0 = jnp.maximum(enter, t0)
     t1 = jnp.maximum(jnp.minimum(leave, t1), t0)
     sigma = media.sigma_t(medium)
-    closed_form = medium.density is None and crossings is None
+    closed_form = medium.density is None
     if closed_form:
         total = t1 - t0
     else:
         shift = 0.5 if u_step is None else u_step
-        marched = march(
-            medium, origin, direction, t0, t1, num_steps=num_steps, crossings=crossings, shift=shift
-        )
+        marched = march(medium, origin, direction, t0, t1, num_steps=num_steps, shift=shift)
         total = total_column(marched)
     level = levels(num_intervals, t0.shape[0], position=position, u=u)
     edges = None
@@ -242,8 +231,8 @@ def interval_map_of_steps(
         rise = sigma * step
         reached = jnp.sum(scale * -jnp.expm1(-before), axis=0)
         gained = jnp.sum(scale * jnp.exp(-before) * -jnp.expm1(-rise), axis=0)
-        # Inside the step the normalised drop bends; one Newton-like correction of the straight line is enough because
-        # weights are evaluated at the place found, whatever it is.
+        # Inside the step the normalised drop bends; the straight line will do because weights are evaluated at the
+        # place found, whatever it is.
         steps = steps + jnp.clip((wanted - reached) / jnp.maximum(gained, _TINY), 0.0, 1.0)
         return (before + rise, steps), None
 

@@ -1,48 +1,31 @@
 """One frame: the stages in order. A host loop, because rays are cast and lists are made between jitted stages."""
 
-from functools import partial
-from time import process_time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol import camera as cameras
-from jaxvol import interval_map as intervals
-from jaxvol import media, ray_casting, sampling
-from jaxvol.interval_map import IntervalMap
+from jaxvol import ray_casting, segments
 from jaxvol.layers import zeros
 from jaxvol.methods.deep_screen_space import framebuffer, lighting, reconstruction, splatting, surfels, tile_lists, transport
+from jaxvol.methods.deep_screen_space.camera_rays import ActiveRays, map_rays, transmittance_of
 from jaxvol.methods.deep_screen_space.lighting import LitSurfels
 from jaxvol.methods.deep_screen_space.planning import LAYER, Plan, coarse_size, group_size
 from jaxvol.types import Camera, Estimate, Layers, Scene
 
-_STREAM = sampling.stream("deep_screen_space.frame")
-_VISIBLE = 1e-7  # rays with less opacity than this show no medium
+
+class Casters:
+    """What a frame casts rays with: the scene's surfaces and the medium's boundaries."""
+
+    def __init__(self, scene: Scene):
+        self.surfaces = ray_casting.caster_for(scene.mesh)
+        self.media = segments.medium_casters(scene.medium)
 
 
-class Clock:
-    """CPU seconds by stage."""
-
-    def __init__(self):
-        self.stages: dict[str, float] = {}
-
-    def __call__(self, name, function, *args, **kwargs):
-        """Run a stage and wait for it."""
-        start = process_time()
-        result = jax.block_until_ready(function(*args, **kwargs))
-        self.stages[name] = self.stages.get(name, 0.0) + process_time() - start
-        return result
-
-
-class ActiveRays:
-    """The camera rays that show medium, in Morton order of their pixels, in arrays of a coarse capacity."""
-
-    def __init__(self, origin, direction, mapped: IntervalMap, pixel, num_rays: int):
-        self.origin, self.direction, self.map, self.pixel, self.num_rays = origin, direction, mapped, pixel, num_rays
-
-
-def light_surfels(scene: Scene, camera: Camera, plan: Plan, caster, *, seed: int) -> tuple[LitSurfels, LitSurfels | None, int]:
+def light_surfels(
+    scene: Scene, camera: Camera, plan: Plan, casters: Casters, *, seed: int
+) -> tuple[LitSurfels, LitSurfels | None, int]:
     """Stages 1 and 2: lit Lambertian entries, glossy ones or None, and the number of surfels that found no slot."""
     eye = np.asarray(camera.world_from_camera)[:3, 3]
     triangles = surfels.subdivide(
@@ -52,59 +35,19 @@ def light_surfels(scene: Scene, camera: Camera, plan: Plan, caster, *, seed: int
     padded = jax.tree.map(lambda a: np.concatenate([a, np.zeros((spare, *a.shape[1:]), a.dtype)]), triangles)
     capacity = coarse_size(int(triangles.count.sum()))
     cloud, lost = surfels.tessellate(padded, capacity=capacity, pattern=plan.pattern)
-    scale = max(1.0, float(np.abs(np.asarray(scene.mesh.vertices)).max()))
     lambert, glossy = lighting.illuminate(
-        scene, cloud, caster, seed=seed, choices=plan.light_choices, num_steps=plan.light_steps, scale=scale
+        scene,
+        cloud,
+        casters.surfaces,
+        transmittance_of(scene.medium, casters.media, num_steps=plan.light_steps),
+        seed=seed,
+        choices=plan.light_choices,
+        scale=float(ray_casting.scene_scale(scene.mesh)),
     )
     return lambert, glossy, int(lost)
 
 
-def map_rays(scene: Scene, camera: Camera, plan: Plan, caster, *, seed: int) -> ActiveRays | None:
-    """Stage 3: the interval map of the rays that show medium; None when none does."""
-    medium = scene.medium
-    rays = cameras.generate_rays(camera, cameras.pixel_centers(camera))
-    enter, leave = (np.asarray(t) for t in media.box_interval(medium.bounds, rays.origin, rays.direction))
-    pixel = np.flatnonzero(leave > enter)
-    if pixel.size == 0:
-        return None
-    pixel = pixel[np.argsort(framebuffer.morton(pixel % camera.width, pixel // camera.width), kind="stable")]
-    direction = np.asarray(rays.direction)[pixel]
-    origin = np.asarray(rays.origin[0])
-    depth, _ = ray_casting.intersect(caster, origin, direction, np.inf)
-    capacity = coarse_size(pixel.size)
-    pad = lambda a: np.concatenate([a, np.repeat(a[-1:], capacity - len(a), axis=0)])  # noqa: E731
-    u, u_step = _jitter(jnp.uint32(seed), jnp.asarray(pad(pixel)))
-    function = intervals.interval_map if plan.weights == "exact" else intervals.paper_interval_map
-    options = {} if plan.weights == "paper" else {"position": plan.position, "grey": plan.grey}
-    jittered = plan.position == "jittered"
-    mapped = function(
-        medium,
-        jnp.broadcast_to(origin, (capacity, 3)),
-        pad(direction),
-        jnp.zeros(capacity, jnp.float32),
-        pad(np.asarray(depth)),
-        num_intervals=plan.num_intervals,
-        num_steps=plan.num_steps,
-        u=u if jittered else None,
-        u_step=u_step if jittered else None,
-        **options,
-    )
-    opaque = np.asarray(mapped.one_minus_transmittance).max(axis=0)[: pixel.size]
-    shown = np.flatnonzero(opaque > _VISIBLE)
-    if shown.size == 0:
-        return None
-    keep = np.concatenate([shown, np.full(coarse_size(shown.size) - shown.size, shown[-1])])
-    mapped = jax.tree.map(lambda a: np.take(np.asarray(a), keep, axis=-1), mapped)
-    return ActiveRays(origin, direction[keep], mapped, pixel[keep], shown.size)
-
-
-@jax.jit
-def _jitter(seed, pixel):
-    u1, u2, _, _ = sampling.uniforms(seed, _STREAM, pixel, 0)
-    return u1, u2
-
-
-def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Plan, caster, *, seed: int):
+def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Plan, casters: Casters, *, seed: int):
     """Stage 5: (table, cell of every sample), or (None, None) without transport."""
     if plan.transport == "none":
         return None, None
@@ -116,56 +59,49 @@ def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Pla
         jnp.uint32(seed),
         resolution=plan.table_resolution,
     )
-    through = partial(_grey_transmittance, scene.medium, num_steps=8)
     table = transport.build_table(
-        lit, cells, caster, through, seed=seed, cluster_size=plan.cluster_size, resolution=plan.table_resolution
+        lit,
+        cells,
+        casters.surfaces,
+        transmittance_of(scene.medium, casters.media, num_steps=plan.transport_steps),
+        seed=seed,
+        cluster_size=plan.cluster_size,
+        resolution=plan.table_resolution,
+        grey=active.map.weight.shape[0] == 1,
     )
     return table, cells.index
 
 
-@partial(jax.jit, static_argnames=("num_steps",))
-def _grey_transmittance(medium, origin, direction, distance, *, num_steps):
-    return lighting.extinction(medium, origin, direction, distance, num_steps=num_steps)[:, 0]
-
-
-def splat_levels(scene: Scene, active: ActiveRays, lit: LitSurfels, table, cells, plan: Plan, *, seed: int, clock: Clock):
-    """Stages 4, 6, 7: the image of every level, [H*W, 3] per level without its rays' weight, and counts."""
-    counts = {}
-    images = []
+def splat_levels(
+    scene: Scene, active: ActiveRays, lit: LitSurfels, table, cells, plan: Plan, *, width: int, seed: int, done: Callable
+) -> tuple[list, dict]:
+    """Stages 4, 6 and 7: per level the tiles' sums, without weights that are constant along rays, and their slots; counts."""
+    counts, images = {}, []
     first = splatting.first_radius(lit.area, lit.radiance, plan.epsilon * mean_radiance(lit), radius=plan.radius)
-    capacity = active.direction.shape[0]
+    capacity, num = active.direction.shape[0], active.num_rays
+    x, y = active.pixel[:num] % width, active.pixel[:num] // width
     for level in range(plan.num_levels):
+        stride = plan.strides[level]
         size = framebuffer.tile_size(capacity, level)
         members = group_size(level, plan.cluster_size)
-        tiles = clock(
-            "tiles",
-            framebuffer.make_tiles,
-            active.x,
-            active.y,
-            level=level,
-            seed=seed,
-            size=size,
-            num_tiles=capacity // size + 4**level,
-            num_rays=capacity,
-            stride=plan.strides[level],
+        num_tiles = capacity // size + 4**level
+        tiles = framebuffer.make_tiles(
+            x, y, level=level, seed=seed, size=size, num_tiles=num_tiles, num_rays=capacity, stride=stride
         )
-        phase = np.concatenate([tiles.phase, np.zeros(capacity - active.num_rays, np.int32)])
-        rays = clock(
-            "tiles",
-            splatting.level_rays,
+        phase = np.concatenate([tiles.phase, np.zeros(capacity - num, np.int32)])
+        rays = splatting.level_rays(
             active.direction,
             active.map.distance,
             active.map.weight,
             cells,
+            active.g,
             tiles.ray,
             tiles.sub_buffer,
             phase,
-            stride=plan.strides[level],
+            stride=stride,
         )
         order = framebuffer.surfel_order(lit.area.shape[0], level=level, seed=seed)
-        level_surfels = clock(
-            "tiles",
-            splatting.level_surfels,
+        senders = splatting.level_surfels(
             lit,
             first,
             active.origin,
@@ -176,18 +112,17 @@ def splat_levels(scene: Scene, active: ActiveRays, lit: LitSurfels, table, cells
             group_size=members,
             cluster_size=plan.cluster_size,
         )
-        groups_each = order.shape[1] // members
+        done("tiles", (rays, senders))
         batch = max(8, 4096 // size)
-        tile, group = clock("lists", _pairs, rays, tiles, level_surfels, plan, level, capacity, groups_each)
-        tile, group, num = tile_lists.pad_list(tile, group, batch=batch)
-        image = clock(
-            f"splat {level}",
-            splatting.splat,
+        pairs = _pairs(rays, tiles, senders, level >= plan.dense_from, capacity, order.shape[1] // members)
+        tile, group, num_pairs = tile_lists.pad_list(*pairs, batch=batch)
+        done("lists", None)
+        image = splatting.splat(
             rays,
-            level_surfels,
+            senders,
             tile,
             group,
-            num,
+            num_pairs,
             table,
             scene.medium.g,
             scene.medium.phase,
@@ -195,16 +130,17 @@ def splat_levels(scene: Scene, active: ActiveRays, lit: LitSurfels, table, cells
             batch=batch,
             glossy=lit.lobe_direction is not None,
         )
-        counts[f"pairs_{level}"] = num * size * members * (plan.num_intervals // plan.strides[level])
-        images.append((image * plan.strides[level], tiles.slot))
+        done(f"splat {level}", image)
+        counts[f"pairs_{level}"] = num_pairs * size * members * (plan.num_intervals // stride)
+        images.append((image * stride, tiles.slot))
     return images, counts
 
 
-def _pairs(rays, tiles, level_surfels, plan, level, capacity, groups_each):
-    if level >= plan.dense_from:
+def _pairs(rays, tiles, senders, all_of_them, capacity, groups_each):
+    if all_of_them:
         return tile_lists.dense(tiles.sub_buffer, (tiles.ray < capacity).any(axis=1), groups_each=groups_each)
     bounds = tile_lists.tile_bounds(rays, tiles.ray, capacity)
-    kept = tile_lists.reachable(bounds, tiles.sub_buffer, level_surfels, groups_each=groups_each)
+    kept = tile_lists.reachable(bounds, tiles.sub_buffer, senders, groups_each=groups_each)
     return tile_lists.listed(kept, tiles.sub_buffer)
 
 
@@ -217,42 +153,62 @@ def mean_radiance(lit: LitSurfels) -> float:
 def padded_surfels(lit: LitSurfels, plan: Plan) -> LitSurfels:
     """In the order of strata, padded to whole sub-buffers and clusters."""
     unit = max(4 ** (plan.num_levels - 1), plan.cluster_size)
-    capacity = -(-lit.area.shape[0] // unit) * unit
-    return lighting.order_for_strata(lit, capacity=capacity, cluster_size=plan.cluster_size)[0]
+    return lighting.order_for_strata(lit, capacity=-(-lit.area.shape[0] // unit) * unit)
 
 
-def render(scene: Scene, camera: Camera, plan: Plan, *, seed: int = 0, clock: Clock | None = None) -> Estimate:
-    """The layer `volume_from_surface` of one frame, [H, W, 3]; `clock` collects CPU seconds by stage.
+def _nothing(name, value):
+    """Stages report to nobody: let them run on."""
 
-    Diagnostics: pairs evaluated by level, lit surfels, active pixels, `overflow` (surfels without a slot; 0).
+
+def render(
+    scene: Scene, camera: Camera, plan: Plan, *, seed: int = 0, on_stage: Callable[[str], None] | None = None
+) -> Estimate:
+    """The layer `volume_from_surface` of one frame, [H, W, 3]; `on_stage(name)` is called after each part of a stage.
+
+    Diagnostics: pairs evaluated by level, lit entries, active pixels; `overflow` counts surfels without a slot and rays
+    with too many boundaries (0 in a healthy frame).
     """
-    clock = Clock() if clock is None else clock
+
+    def report(name, value):
+        jax.block_until_ready(value)
+        on_stage(name)
+
+    done = _nothing if on_stage is None else report
     shape = (camera.height, camera.width)
     nothing = Estimate(mean=zeros((LAYER,), shape), diagnostics={"overflow": jnp.int32(0)})
     if not plan.active:
         return nothing
-    caster = ray_casting.caster_for(scene.mesh)
-    lambert, glossy, lost = clock("surfels", light_surfels, scene, camera, plan, caster, seed=seed)
-    active = clock("map", map_rays, scene, camera, plan, caster, seed=seed)
+    casters = Casters(scene)
+    lambert, glossy, lost = light_surfels(scene, camera, plan, casters, seed=seed)
+    done("surfels", None)
     entries = [lit for lit in (lambert, glossy) if lit is not None and lit.area.shape[0] > 0]
-    if active is None or not entries:
+    if not entries:
         return nothing
-    active.x, active.y = active.pixel[: active.num_rays] % camera.width, active.pixel[: active.num_rays] // camera.width
+    active = map_rays(scene, camera, plan, casters.surfaces, casters.media, seed=seed)
+    done("map", None)
+    if active is None:
+        return nothing
     num_pixels = camera.height * camera.width
-    target = np.where(np.arange(len(active.pixel)) < active.num_rays, active.pixel, num_pixels)[: active.num_rays]
+    target = active.pixel[: active.num_rays]
     levels = [jnp.zeros((num_pixels, 3), jnp.float32)] * plan.num_levels
-    diagnostics = {"overflow": jnp.int32(lost), "active_pixels": jnp.int32(active.num_rays)}
+    diagnostics = {
+        "overflow": jnp.int32(lost + active.num_overflows),
+        "active_pixels": jnp.int32(active.num_rays),
+        "surfels": jnp.int32(sum(lit.area.shape[0] for lit in entries)),
+    }
     for lit in entries:
-        lit = clock("order", padded_surfels, lit, plan)
-        table, cells = clock("table", build_transport, scene, active, lit, plan, caster, seed=seed)
-        images, counts = splat_levels(scene, active, lit, table, cells, plan, seed=seed, clock=clock)
+        lit = padded_surfels(lit, plan)
+        done("order", None)
+        table, cells = build_transport(scene, active, lit, plan, casters, seed=seed)
+        done("table", None)
+        images, counts = splat_levels(scene, active, lit, table, cells, plan, width=camera.width, seed=seed, done=done)
         for level, (tiles, slot) in enumerate(images):
-            image = clock("unshuffle", reconstruction.unshuffle, tiles, slot, target, num_pixels=num_pixels)
-            levels[level] = levels[level] + image
+            levels[level] = levels[level] + reconstruction.unshuffle(tiles, slot, target, num_pixels=num_pixels)
+        done("unshuffle", levels)
         for name, count in counts.items():
             diagnostics[name] = diagnostics.get(name, 0) + jnp.asarray(count, jnp.float32)
-    diagnostics["surfels"] = jnp.int32(sum(lit.area.shape[0] for lit in entries))
-    image = clock("blur", _compose, levels, active.map, target, shape, plan)
+    image = _compose(levels, active.map, target, shape, plan)
+    done("blur", image)
     return Estimate(mean=Layers(**{LAYER: image}), diagnostics=diagnostics)
 
 

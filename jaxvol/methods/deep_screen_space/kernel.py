@@ -44,13 +44,13 @@ def pair_samples(
     surfel: dict[str, Float[Array, "B 1"]],
     *,
     phase: str,
-    g: Float[Array, ""] | None = None,
+    g: Float[Array, ""] | Sequence[Float[Array, "B T"]] | None = None,
     table: PhaseTable | None = None,
 ) -> list[Float[Array, "B T"]]:
     """For each sample cos(surfel) phase / (d2 + delta) inside the shell, else 0, without `phase_scale`.
 
     `ray` is the unit direction (by component), `surfel` the row's columns with x, y, z = surfel minus the rays' common
-    origin. With `lx` etc. in the row the Phong lobe (n+2)/(2 pi) cos^n multiplies the cosine.
+    origin. `g` may be given per sample. With `lx` etc. in the row the Phong lobe (n+2)/(2 pi) cos^n multiplies the cosine.
     """
     wx, wy, wz = ray
     b = -(wx * surfel["x"] + wy * surfel["y"] + wz * surfel["z"])
@@ -62,11 +62,9 @@ def pair_samples(
     if glossy:
         lobe_f = wx * surfel["lx"] + wy * surfel["ly"] + wz * surfel["lz"]
         lobe_e = qx * surfel["lx"] + qy * surfel["ly"] + qz * surfel["lz"]
-    if phase == "henyey_greenstein":
-        g = jnp.clip(g, -MAX_ABS_G, MAX_ABS_G)
-        spread, twice, least = 1.0 + g * g, 2.0 * g, (1.0 - jnp.abs(g)) * (1.0 - jnp.abs(g))
+    cosines = list(g) if isinstance(g, (list, tuple)) else [g] * len(distances)
     values = []
-    for d in distances:
+    for d, mean_cosine in zip(distances, cosines, strict=True):
         u = d + b
         d2 = h2 + u * u
         value = jnp.maximum(e + u * f, 0.0)
@@ -75,8 +73,9 @@ def pair_samples(
         if phase == "isotropic":
             value = value / (d2 * jnp.sqrt(d2))
         elif phase == "henyey_greenstein":
-            x = spread * d2 + twice * u * jnp.sqrt(d2)
-            x = jnp.maximum(x, least * d2)
+            a = jnp.clip(mean_cosine, -MAX_ABS_G, MAX_ABS_G)
+            x = (1.0 + a * a) * d2 + 2.0 * a * u * jnp.sqrt(d2)
+            x = jnp.maximum(x, (1.0 - jnp.abs(a)) * (1.0 - jnp.abs(a)) * d2)  # its least value, lost to rounding
             value = value / (x * jnp.sqrt(x))
         else:
             root = jnp.sqrt(d2)

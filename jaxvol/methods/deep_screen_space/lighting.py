@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxvol import lights, materials, media, ray_casting, sampling
+from jaxvol import lights, materials, ray_casting, sampling
 from jaxvol.methods.deep_screen_space.surfels import Surfels
 from jaxvol.types import Mesh, Scene
 
@@ -81,28 +81,8 @@ def _open(u):
     return jnp.clip(u, 1e-6, 1.0 - 1e-6)
 
 
-@partial(jax.jit, static_argnames=("num_steps",))
-def extinction(
-    medium, origin: Float[Array, "R 3"], direction: Float[Array, "R 3"], distance: Float[Array, "R"], *, num_steps: int = 32
-) -> Float[Array, "R 3"]:
-    """Transmittance along segments by `num_steps` midpoint steps; exact in homogeneous media. Ignores inclusions."""
-    enter, leave = media.box_interval(medium.bounds, origin, direction)
-    length = jnp.maximum(jnp.minimum(leave, distance) - enter, 0.0)
-    column = length
-    if medium.density is not None:
-        packed = media.pack_corners(medium.density)
-        step = length / num_steps
-
-        def body(i, total):
-            points = origin + (enter + (i + 0.5) * step)[:, None] * direction
-            return total + media.density_packed(packed, medium.density.shape, medium.bounds, points)
-
-        column = step * jax.lax.fori_loop(0, num_steps, body, jnp.zeros_like(length))
-    return jnp.exp(-column[:, None] * media.sigma_t(medium))
-
-
 def shadow(
-    connections: Connections, surfels: Surfels, mesh: Mesh, caster: ray_casting.Caster, *, scale: float
+    connections: Connections, surfels: Surfels, caster: ray_casting.Caster, *, scale: float
 ) -> Connections:
     """The connections with occluded ones set to zero. Eager: casts only rays that carry light."""
     irradiance = np.array(connections.irradiance)
@@ -170,30 +150,27 @@ def illuminate(
     scene: Scene,
     surfels: Surfels,
     caster: ray_casting.Caster,
+    transmittance,
     *,
     seed: int,
     choices: tuple[tuple[int, int], ...],
-    num_steps: int = 32,
     scale: float = 1.0,
 ) -> tuple[LitSurfels, LitSurfels | None]:
-    """The lit surfels of the scene: connect, shadow, attenuate, emit."""
+    """The lit surfels of the scene: connect, shadow, attenuate, emit.
+
+    `transmittance(origin, direction, distance) -> [n, 3]` of segments.
+    """
     connections = connect(scene, surfels, jnp.uint32(seed), choices=choices)
-    connections = shadow(connections, surfels, scene.mesh, caster, scale=scale)
-    if scene.medium is not None:
-        connections = attenuate(
-            connections, surfels, partial(extinction, scene.medium, num_steps=num_steps)
-        )
+    connections = shadow(connections, surfels, caster, scale=scale)
+    connections = attenuate(connections, surfels, transmittance)
     return emit(surfels, connections, scene.mesh)
 
 
-def order_for_strata(
-    lit: LitSurfels, *, capacity: int, cluster_size: int, normal_weight: float = 0.5
-) -> tuple[LitSurfels, Int[np.ndarray, "C"]]:
+def order_for_strata(lit: LitSurfels, *, capacity: int, normal_weight: float = 0.5) -> LitSurfels:
     """The surfels in an order in which neighbours in the list are neighbours in space, padded to `capacity` with area 0.
 
     Balanced k-d splits over position and (weighted by `normal_weight` times the extent) normal: consecutive runs of any
-    power of two are compact patches of like orientation, which stratifies the splat's sub-buffers and makes clusters.
-    Second: the first slot of every cluster of `cluster_size` slots that holds a surfel. Eager.
+    power of two are compact patches of like orientation, which stratifies the splat's sub-buffers and makes clusters. Eager.
     """
     num = lit.area.shape[0]
     position, normal = np.asarray(lit.position), np.asarray(lit.normal)
@@ -205,8 +182,7 @@ def order_for_strata(
         fill = np.zeros((capacity - num, *value.shape[1:]), value.dtype)
         return np.concatenate([value[order], fill])
 
-    arranged = jax.tree.map(arrange, lit)
-    return arranged, np.arange(0, max(num, 1), cluster_size)
+    return jax.tree.map(arrange, lit)
 
 
 def _kd_order(points: Float[np.ndarray, "S D"], *, leaf: int) -> Int[np.ndarray, "S"]:

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxvol import interval_map, media
+from jaxvol import interval_map, media, segments
 from jaxvol.layers import Claim
-from jaxvol.methods.deep_screen_space import kernel, lighting, reconstruction, splatting, surfels
+from jaxvol.methods.deep_screen_space import lighting, reconstruction, splatting, surfels
 from jaxvol.types import Camera, Scene
 
 LAYER = "volume_from_surface"
@@ -36,6 +36,7 @@ class Plan:
     strides: tuple[int, ...]  # on each level every stride-th sample of a ray
     light_choices: tuple[tuple[int, int], ...]
     light_steps: int
+    transport_steps: int
     grey: bool
     phase: str
     active: bool  # False: the layer is exactly zero
@@ -45,6 +46,10 @@ class Plan:
 def claims(scene: Scene) -> tuple[Claim, ...]:
     """`volume_from_surface`: complete, unless the medium bends rays (an index of refraction)."""
     partial = None
+    if scene.medium is not None and scene.medium.inclusions and any(
+        part.phase is not None for part in (scene.medium, *scene.medium.inclusions)
+    ):
+        partial = "inclusions with a tabulated phase function scatter with the outer medium's, or by their mean cosine"
     if scene.medium is not None and scene.medium.ior is not None:
         partial = "rays are not bent at changes of the refractive index"
     return (Claim((LAYER,), partial),)
@@ -76,13 +81,14 @@ def plan(
     transport: str = "table",
     blur: str = "demodulated",
     pattern: str = "congruent",
-    cluster_size: int = 512,
+    cluster_size: int = 256,
     table_resolution: int = 16,
     dense_from: int = 3,
     strides: tuple[int, ...] | None = None,
     num_area_samples: int = 4,
     num_environment_samples: int = 8,
     light_steps: int = 32,
+    transport_steps: int = 8,
     specialize: str = "values",
 ) -> Plan:
     """Check the options, look at the scene, decide what to skip. Eager.
@@ -112,16 +118,19 @@ def plan(
         ("num_area_samples", num_area_samples, 1, 1024),
         ("num_environment_samples", num_environment_samples, 1, 1024),
         ("light_steps", light_steps, 1, 4096),
+        ("transport_steps", transport_steps, 1, 4096),
     ):
         _range(name, value, low, high)
     if cluster_size < 16 or cluster_size & (cluster_size - 1):
         raise ValueError(f"cluster_size = {cluster_size} must be a power of two, at least 16")
     if strides is None:
-        strides = tuple(1 for _ in range(num_levels))
+        strides = tuple(s if num_intervals % s == 0 else 1 for s in (1, 1, 2, 4, 4, 4, 4)[:num_levels])
     if len(strides) != num_levels or any(s < 1 or num_intervals % s for s in strides):
         raise ValueError(f"strides = {strides} must give each of the {num_levels} levels a divisor of {num_intervals}")
     if weights == "paper" and position == "midpoint":
         raise ValueError("weights = 'paper' are right-endpoint sums: position must be 'far' or 'jittered'")
+    if weights == "paper" and scene.medium is not None and not segments.is_box(scene.medium):
+        raise ValueError("weights = 'paper' are for one medium in its box, without boundary mesh or inclusions")
     choices = lighting.light_choices(
         scene, num_area_samples=num_area_samples, num_environment_samples=num_environment_samples
     )
@@ -133,6 +142,8 @@ def plan(
     phase = "henyey_greenstein"
     if active and medium.phase is not None:
         phase = "table"
+        if medium.inclusions and any(part.phase is None for part in medium.inclusions):
+            raise ValueError("a tabulated phase function in the medium and none in an inclusion cannot be mixed")
     elif by_value and media.is_isotropic(medium):
         phase = "isotropic"
         skipped += ("the phase function is constant: the kernel without it",)
@@ -161,6 +172,7 @@ def plan(
         strides=tuple(strides),
         light_choices=choices,
         light_steps=light_steps,
+        transport_steps=transport_steps,
         grey=bool(grey),
         phase=phase,
         active=active,
@@ -193,8 +205,3 @@ def coarse_size(num: int, *, least: int = 256) -> int:
         return least
     step = 1 << max((num - 1).bit_length() - 4, 0)
     return -(-num // step) * step
-
-
-def kernel_uses_table(plan: Plan) -> bool:
-    """Whether phase functions are looked up."""
-    return plan.phase == kernel.PHASES[2]

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxvol import lights, materials, phase, ray_casting, sampling
-from jaxvol.methods.deep_screen_space import frame, kernel, lighting, splatting
+from jaxvol.methods.deep_screen_space import frame, kernel, splatting
+from jaxvol.methods.deep_screen_space.camera_rays import map_rays, transmittance_of
 from jaxvol.methods.deep_screen_space.planning import Plan
 from jaxvol.types import Camera, Medium, Scene
 
@@ -48,9 +49,10 @@ def exact_pairs(
     chunk: int = 64,
 ) -> Float[np.ndarray, "n 3"]:
     """A1 for flat pixel indices: every pair with its own shadow ray and `num_steps` steps of extinction; Lambert only."""
-    caster = ray_casting.caster_for(scene.mesh)
-    lit, _, _ = frame.light_surfels(scene, camera, plan, caster, seed=seed)
-    active = frame.map_rays(scene, camera, plan, caster, seed=seed)
+    casters = frame.Casters(scene)
+    caster, transmittance = casters.surfaces, transmittance_of(scene.medium, casters.media, num_steps=num_steps)
+    lit, _, _ = frame.light_surfels(scene, camera, plan, casters, seed=seed)
+    active = map_rays(scene, camera, plan, caster, casters.media, seed=seed, pixels=pixels)
     place = {int(p): i for i, p in enumerate(active.pixel[: active.num_rays])}
     out = np.zeros((len(pixels), 3), np.float32)
     # One level that holds all distances.
@@ -82,14 +84,8 @@ def exact_pairs(
             values = np.where(blocked, 0.0, values)
         through = 1.0
         if attenuation:
-            through = lighting.extinction(
-                scene.medium,
-                jnp.asarray(np.broadcast_to(np.asarray(lit.position), toward.shape).reshape(-1, 3)),
-                jnp.asarray(toward.reshape(-1, 3)),
-                jnp.asarray(length.reshape(-1)),
-                num_steps=num_steps,
-            )
-            through = np.asarray(through).reshape(*length.shape, 3)
+            starts = np.broadcast_to(np.asarray(lit.position), toward.shape).reshape(-1, 3)
+            through = transmittance(starts, toward.reshape(-1, 3), length.reshape(-1)).reshape(*length.shape, 3)
         received = np.einsum("ps,psc,sc->pc", values, np.broadcast_to(through, (*length.shape, 3)), emitted)
         received = received * weight[full[:, 2], :, full[:, 1]]
         np.add.at(out, part[:, 0], received[: len(part)])
@@ -128,8 +124,9 @@ def gather(
     """A2 for flat pixel indices: mean and standard error. From every sample of the plan's map `num_directions` rays by
     the phase function; where they meet a surface, one light sample. The n-th direction of all samples is one estimate.
     """
-    caster = ray_casting.caster_for(scene.mesh)
-    active = frame.map_rays(scene, camera, plan, caster, seed=seed)
+    casters = frame.Casters(scene)
+    caster, transmittance = casters.surfaces, transmittance_of(scene.medium, casters.media, num_steps=num_steps)
+    active = map_rays(scene, camera, plan, caster, casters.media, seed=seed, pixels=pixels)
     place = {int(p): i for i, p in enumerate(active.pixel[: active.num_rays])}
     known = np.array([place.get(int(p), -1) for p in pixels])
     rows = np.flatnonzero(known >= 0)
@@ -149,9 +146,9 @@ def gather(
         hit = ray_casting.hits(scene.mesh, point, looking, t, face)
         light, radiance, origin = _next_event(scene, hit, looking, v[0], v[1], v[2])
         blocked = ray_casting.occluded(caster, origin, light.direction, light.distance * (1.0 - _MARGIN))
-        near = lighting.extinction(scene.medium, point, looking, jnp.where(hit.valid, t, 0.0), num_steps=num_steps)
-        far = lighting.extinction(scene.medium, hit.position, light.direction, light.distance, num_steps=num_steps)
-        found = np.where(np.asarray(blocked)[:, None], 0.0, np.asarray(radiance * near * far))
+        near = transmittance(point, looking, jnp.where(hit.valid, t, 0.0))
+        far = transmittance(hit.position, light.direction, light.distance)
+        found = np.where(np.asarray(blocked)[:, None], 0.0, np.asarray(radiance) * near * far)
         found = (found.reshape(num_samples, num, 3) * np.swapaxes(weight, 1, 2)).sum(axis=0)
         total += found
         square += found * found

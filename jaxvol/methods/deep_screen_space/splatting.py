@@ -29,6 +29,7 @@ class LevelRays(eqx.Module):
     distance: Float[Array, "tiles n T"]
     weight: Float[Array, "tiles n 3 T"] | None  # per sample and channel; None when constant along a ray
     cell: Int[Array, "tiles n T"] | None  # of the transport table, per sample
+    g: Float[Array, "tiles n T"] | None  # mean cosine at each sample; None when one number serves all
     sub_buffer: Int[Array, "tiles"]
 
 
@@ -96,6 +97,7 @@ def level_rays(
     distance: Float[Array, "N A"],
     weight: Float[Array, "M 3 A"],
     cell: Int[Array, "N A"] | None,
+    g: Float[Array, "N A"] | None,
     ray: Int[Array, "tiles T"],
     sub_buffer: Int[Array, "tiles"],
     phase: Int[Array, "A"],
@@ -130,6 +132,7 @@ def level_rays(
         distance=arrange(thin(distance)),
         weight=weights,
         cell=None if cell is None else arrange(thin(cell)),
+        g=None if g is None else arrange(thin(g)),
         sub_buffer=sub_buffer,
     )
 
@@ -146,7 +149,7 @@ def splat(
     tile: Int[Array, "capacity"],
     group: Int[Array, "capacity"],
     num_pairs: Int[Array, ""],
-    transport: Float[Array, "clusters cells"] | None,
+    transport: Float[Array, "channels clusters cells"] | None,
     g: Float[Array, ""],
     table: PhaseTable | None,
     *,
@@ -157,12 +160,13 @@ def splat(
     """Sum over the listed (tile, group) pairs of what the group's surfels send through the tile's samples, per ray.
 
     `capacity` is a multiple of `batch`; entries from `num_pairs` on are skipped, whole batches at no cost. `transport`
-    is looked up at the samples' cells, once for all surfels of a group.
+    is looked up at the samples' cells, once for all surfels of a group; three channels of it need weights per sample.
     """
     names = kernel.GLOSSY_COLUMNS if glossy else kernel.COLUMNS
     num_tiles, num_samples, size = rays.distance.shape
     group_size = surfels.row.shape[1]
-    factor = kernel.phase_scale(phase, g)
+    # With its own g every sample's weight holds the phase function's factor already.
+    factor = kernel.phase_scale(phase, g) if rays.g is None else 1.0
 
     def one_batch(index, images):
         chosen = index * batch + jnp.arange(batch)
@@ -177,25 +181,33 @@ def splat(
         factors = None
         if transport is not None:
             cells = _rows(rays.cell, safe)
-            cluster = _rows(surfels.cluster, k)[:, None] * transport.shape[1]
-            factors = [_rows(transport.reshape(-1), cluster + cells[:, n]) for n in range(num_samples)]
+            cluster = _rows(surfels.cluster, k)[:, None] * transport.shape[2]
+            factors = [
+                [_rows(channel.reshape(-1), cluster + cells[:, n]) for n in range(num_samples)] for channel in transport
+            ]
+        mean_cosine = g
+        if rays.g is not None:
+            cosines = _rows(rays.g, safe)
+            mean_cosine = [cosines[:, n] for n in range(num_samples)]
         if rays.weight is not None:
             weight = _rows(rays.weight, safe)
             weights = [[weight[:, n, c] for n in range(num_samples)] for c in range(3)]
             if factors is not None:
-                weights = [[w * f for w, f in zip(channel, factors, strict=True)] for channel in weights]
+                weights = [
+                    [w * f for w, f in zip(weights[c], factors[c % len(factors)], strict=True)] for c in range(3)
+                ]
         rows = _rows(surfels.row, k)
 
         def one_surfel(m, sums):
             row = lax.dynamic_index_in_dim(rows, m, 1, keepdims=False)
             surfel = {name: row[:, i : i + 1] for i, name in enumerate(names)}
-            values = kernel.pair_samples(ray, distances, surfel, phase=phase, g=g, table=table)
+            values = kernel.pair_samples(ray, distances, surfel, phase=phase, g=mean_cosine, table=table)
             colours = [surfel[name] for name in ("red", "green", "blue")]
             if rays.weight is not None:
                 totals = [sum(v * w for v, w in zip(values, channel, strict=True)) for channel in weights]
                 return tuple(s + c * total for s, c, total in zip(sums, colours, totals, strict=True))
             if factors is not None:
-                values = [v * f for v, f in zip(values, factors, strict=True)]
+                values = [v * f for v, f in zip(values, factors[0], strict=True)]
             total = sum(values[1:], start=values[0])
             return tuple(s + c * total for s, c in zip(sums, colours, strict=True))
 

@@ -106,10 +106,11 @@ def build_table(
     seed: int,
     cluster_size: int,
     resolution: int,
-) -> Float[np.ndarray, "C cells"]:
-    """Transmittance (scalar) times visibility of every cluster and occupied cell. Eager, because it casts rays.
+    grey: bool,
+) -> Float[np.ndarray, "channels C cells"]:
+    """Transmittance times visibility of every cluster and occupied cell, one channel if grey. Eager: it casts rays.
 
-    `transmittance(origin, direction, distance) -> [n]`. Cells that no sample looks up stay 0.
+    `transmittance(origin, direction, distance) -> [n, 3]`. Cells that no sample looks up stay 0.
     """
     num_clusters = lit.area.shape[0] // cluster_size
     used = np.flatnonzero(np.asarray(cells.count) > 0)
@@ -118,10 +119,11 @@ def build_table(
     points = np.asarray(cells.centre)[padded]
     origin, direction, distance = representatives(lit, points, jnp.uint32(seed), cluster_size=cluster_size)
     through = transmittance(origin.reshape(-1, 3), direction.reshape(-1, 3), distance.reshape(-1))
-    through = np.asarray(through).reshape(num_clusters, size)[:, : used.size]
+    channels = 1 if grey else 3
+    through = np.asarray(through)[:, :channels].T.reshape(channels, num_clusters, size)[..., : used.size]
     flat = [np.asarray(a)[:, : used.size].reshape(num_clusters * used.size, -1) for a in (origin, direction)]
     length = np.asarray(distance)[:, : used.size].reshape(-1) * (1.0 - _MARGIN)
     blocked = np.asarray(ray_casting.occluded(caster, *flat, length)).reshape(num_clusters, used.size)
-    table = np.zeros((num_clusters, resolution**3), np.float32)
-    table[:, used] = np.where(blocked, 0.0, through)
+    table = np.zeros((channels, num_clusters, resolution**3), np.float32)
+    table[:, :, used] = np.where(blocked, 0.0, through)
     return table
