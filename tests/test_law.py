@@ -164,7 +164,21 @@ def positional_options(path: Path, tree: ast.AST) -> Iterator[str]:
             yield f"{function.lineno}: {function.name}: options (arguments with a default) must be keyword-only"
 
 
+# Uniform barycentrics and indices into a table, whose density the caller knows; particles that carry power / pdf.
+WITHOUT_PDF = {"sample_triangle", "sample_cdf", "sample_emission"}
+
+
+def samplers_without_pdf(path: Path, tree: ast.AST) -> Iterator[str]:
+    if path.parent != PACKAGE:
+        return
+    names = {function.name for function in public_functions(tree)}
+    for name in sorted(names - WITHOUT_PDF):
+        if re.match("sample(_|$)", name) and not name.endswith("_pdf") and f"{name}_pdf" not in names:
+            yield f"1: {name} has no {name}_pdf beside it"
+
+
 RULES = (
+    samplers_without_pdf,
     imports_upwards,
     too_long,
     sets_jax_options,
@@ -203,6 +217,7 @@ def test_law(rule):
         (forbidden_jax, "f = jax.jit(lambda x: x)\n", "media.py"),
         (writes_in_place, "open(path, 'wb')\n", "media.py"),
         (writes_in_place, "path.write_text('a')\n", "media.py"),
+        (samplers_without_pdf, "def sample_cone(u):\n    return u\n", "sampling.py"),
         (undocumented, "'''Doc.'''\ndef f(x):\n    return x\n", "media.py"),
         (positional_options, "def f(x, size=3):\n    return x\n", "media.py"),
     ],
