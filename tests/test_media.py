@@ -105,7 +105,9 @@ def test_a_spike_reaches_only_the_cells_its_interpolant_reaches():
 
 
 def interval(origin, direction):
-    t0, t1 = media.box_interval(jnp.asarray([[-1.0] * 3, [1.0] * 3]), jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32))
+    t0, t1 = media.box_interval(
+        jnp.asarray([[-1.0] * 3, [1.0] * 3]), jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32)
+    )
     return float(t0), float(t1)
 
 
@@ -143,7 +145,9 @@ def test_box_interval_against_float64():
     t0 = np.maximum(np.minimum(a, b).max(axis=1), 0.0)
     t1 = np.maximum(a, b).min(axis=1)
     length = np.maximum(t1 - t0, 0.0)
-    found0, found1 = media.box_interval(jnp.asarray(BOUNDS), jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32))
+    found0, found1 = media.box_interval(
+        jnp.asarray(BOUNDS), jnp.asarray(origin, jnp.float32), jnp.asarray(direction, jnp.float32)
+    )
     assert (length > 0).sum() > 100
     np.testing.assert_allclose(np.maximum(np.asarray(found1) - np.asarray(found0), 0), length, atol=2e-5)
     np.testing.assert_allclose(np.asarray(found0)[length > 1e-4], t0[length > 1e-4], atol=2e-5)
@@ -158,7 +162,9 @@ def test_what_a_medium_says_of_itself():
     assert media.is_empty(medium(0 * ones)) and not media.is_empty(medium(ones))
     assert media.is_empty(medium(sigma_s=(0, 0, 0), sigma_a=(0, 0, 0)))
     triangle = Mesh(jnp.eye(3), jnp.asarray([[0, 1, 2]]), jnp.ones((1, 3)))
-    nested = medium(sigma_s=(1, 1, 1), sigma_a=(0, 0, 0), boundary=triangle, inclusions=(medium(ones, g=0.5, boundary=triangle),))
+    nested = medium(
+        sigma_s=(1, 1, 1), sigma_a=(0, 0, 0), boundary=triangle, inclusions=(medium(ones, g=0.5, boundary=triangle),)
+    )
     assert not (media.is_grey(nested) or media.is_isotropic(nested) or media.is_homogeneous(nested))
     np.testing.assert_allclose(media.sigma_t(coloured), [1.5, 2.0, 3.25])
     np.testing.assert_allclose(media.single_scattering_albedo(coloured), [1 / 1.5, 1.0, 3 / 3.25], rtol=1e-6)
