@@ -200,7 +200,7 @@ def test_a_disk_that_fills_leaves_no_half_written_file(fake, scene, tmp_path, ca
     assert status == 2
     assert [path.name for path in out.iterdir()] == ["tiny.exr"]
     assert (out / "tiny.exr").read_bytes() == b"the picture of yesterday"
-    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: ")
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("error: cannot write the picture into ")
 
 
 # --- the real thing

@@ -51,7 +51,10 @@ def render(
         advance(100 * (1.0 - done))
     if explain:
         _explain(result)
-    _write(file, result, out)
+    try:
+        _write(file, result, out)
+    except OSError as error:  # a disk that filled: some writers do not say which file
+        raise OSError(f"cannot write the picture into {out}: {error.strerror or error}") from error
     if result.nonfinite_pixels:
         _say(f"error: {result.nonfinite_pixels} pixels are not finite (magenta in the PNG)")
         raise typer.Exit(1)
