@@ -14,16 +14,16 @@ from jax import lax
 
 from jaxvol import ray_casting, segments
 from jaxvol.methods.path_tracing import sensors
-from jaxvol.methods.path_tracing.lanes import Casts, Lanes, Settings, idle, num_columns
+from jaxvol.methods.path_tracing.lanes import Casts, Lanes, Settings, flush, flush_host, idle, num_columns
 from jaxvol.methods.path_tracing.step import Work, step
 from jaxvol.ray_casting import EmbreeCaster
 from jaxvol.types import Scene
 
 
-@partial(jax.jit, static_argnames=("settings",), donate_argnames=("film",))
-def _jit_step(scene, sensor, settings, seed, lanes, casts, work, film):
-    lanes, work, film = step(scene, sensor, settings, seed, lanes, casts, work, film)
-    return lanes, work, film, jnp.any(lanes.alive | lanes.finished.valid)
+@partial(jax.jit, static_argnames=("settings",))
+def _jit_step(scene, sensor, settings, seed, lanes, casts, work):
+    lanes, work, ended = step(scene, sensor, settings, seed, lanes, casts, work)
+    return lanes, work, ended, jnp.any(lanes.alive | lanes.finished.valid)
 
 
 def no_casts(lanes: Lanes) -> Casts:
@@ -129,7 +129,7 @@ def run(
     caster = ray_casting.caster_for(scene.mesh, kind=kind)
     medium_casters = segments.medium_casters(scene.medium, kind=kind) if settings.bounded else ()
     lanes = idle(num_lanes, groups=groups, num_shadows=num_shadows, tracked=settings.tracked, equiangular=settings.equiangular)
-    film = jnp.zeros((2 * num_pixels, num_columns(groups)), jnp.float32)
+    film = np.zeros((2 * num_pixels, num_columns(groups)), np.float32)
     items = num_pixels * num_samples
     work = Work(jnp.uint32(0), jnp.uint32(items), jnp.uint32(first_sample), jnp.int32(first_pixel), num_pixels)
     seed = jnp.uint32(seed)
@@ -140,12 +140,13 @@ def run(
     count = 0
     busy = True
     while busy:
-        lanes, work, film, busy = _jit_step(scene, sensor, settings, seed, lanes, casts, work, film)
+        lanes, work, ended, busy = _jit_step(scene, sensor, settings, seed, lanes, casts, work)
+        flush_host(film, ended.sums, ended.finished, num_pixels, first_pixel)
         casts = _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spans)
         count += 1
         if on_step is not None and count % 16 == 0:
             on_step(min(int(work.next), items) / items)
-    return np.asarray(film)
+    return film
 
 
 @partial(jax.jit, static_argnames=("settings", "max_spans"), donate_argnames=("film",))
@@ -153,7 +154,8 @@ def _device_loop(scene, sensor, settings, seed, lanes, work, film, caster, mediu
     def body(state):
         lanes, work, film, _ = state
         casts = cast_all(scene, caster, medium_casters, lanes, settings, max_spans)
-        lanes, work, film = step(scene, sensor, settings, seed, lanes, casts, work, film)
+        lanes, work, ended = step(scene, sensor, settings, seed, lanes, casts, work)
+        film = flush(film, ended.sums, ended.finished, work.num_pixels, work.first_pixel)
         return lanes, work, film, jnp.any(lanes.alive | lanes.finished.valid)
 
     state = (lanes, work, film, jnp.array(True))

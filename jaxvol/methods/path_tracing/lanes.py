@@ -1,7 +1,7 @@
 """The state of many light paths traced side by side, and the film that collects finished ones.
 
-A lane holds one path from the eye. When it ends, the lane's sums move to `Finished`, the next work item starts in the
-same lane, and the finished sample is flushed to the film once its last shadow ray is resolved.
+A lane holds one path from the eye. When it ends, the next work item starts in the same lane at once; the lane's sums
+still belong to the ended sample, and go to the film when its last shadow ray is resolved, before the new one adds any.
 
 A sample's radiance is kept by group; X is the type (surface or volume) of its first vertex from the eye:
 """
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 EMISSION, SURFACE_LIGHT, VOLUME_LIGHT, FROM_SURFACE, FROM_VOLUME, FROM_MULTIPLE = range(6)
@@ -67,9 +68,8 @@ class Shadow(eqx.Module):
 
 
 class Finished(eqx.Module):
-    """A sample whose path has ended."""
+    """A sample whose path has ended; its sums are still in the lane."""
 
-    sums: Sums
     pixel: Int[Array, "n"]
     sample: UInt[Array, "n"]
     first_volume: Bool[Array, "n"]
@@ -141,7 +141,6 @@ def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: 
     u = lambda: jnp.zeros(n, jnp.uint32)  # noqa: E731
     b = lambda: jnp.zeros(n, bool)  # noqa: E731
     x = lambda: jnp.tile(jnp.array([1.0, 0.0, 0.0], jnp.float32), (n, 1))  # noqa: E731
-    sums = lambda: tuple(f(n, 3) if g in groups else None for g in range(NUM_GROUPS))  # noqa: E731
     return Lanes(
         pixel=i(),
         sample=u(),
@@ -155,9 +154,9 @@ def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: 
         first_volume=b(),
         last_volume=b(),
         event=u(),
-        sums=sums(),
+        sums=tuple(f(n, 3) if g in groups else None for g in range(NUM_GROUPS)),
         shadows=tuple(Shadow(f(n, 3), x(), f(n), f(n, 3), i(), b(), b(), u()) for _ in range(num_shadows)),
-        finished=Finished(sums(), i(), u(), b(), b()),
+        finished=Finished(i(), u(), b(), b()),
         flight=Flight(i(), f(n), i(), f(n, 3), i(), b(), i(), u()) if tracked else None,
         segment=Segment(f(n, 3), x(), f(n), f(n), f(n)) if equiangular else None,
         recast=b(),
@@ -182,11 +181,32 @@ def num_columns(groups: tuple[int, ...]) -> int:
     return 6 * (len(groups) + 1)
 
 
-def flush(film: Float[Array, "rows columns"], finished: Finished, ready: Bool[Array, "n"], num_pixels: int):
-    """Add finished samples to the film: row = type of the first vertex * num_pixels + pixel."""
-    sums = jnp.concatenate([s for s in finished.sums if s is not None], axis=1)
-    total = sum(s for s in finished.sums if s is not None)
-    columns = jnp.concatenate([sums, total, sums * sums, total * total], axis=1)
-    row = finished.pixel + jnp.where(finished.first_volume, num_pixels, 0)
-    row = jnp.where(finished.valid & ready, row, film.shape[0])
-    return film.at[row].add(columns, mode="drop")
+def film_columns(sums: Sums) -> Float[Array, "n columns"]:
+    """What a sample adds to the film: its groups, their total, and the squares of both. numpy or JAX."""
+    xp = np if isinstance(sums[0], np.ndarray) else jnp
+    groups = [s for s in sums if s is not None]
+    values = xp.concatenate([*groups, sum(groups)], axis=1)
+    return xp.concatenate([values, values * values], axis=1)
+
+
+def flush(film: Float[Array, "rows columns"], sums: Sums, finished: Finished, num_pixels: int, first_pixel):
+    """Add the valid finished samples to the film; row = type of the first vertex * num_pixels + pixel."""
+    row = finished.pixel - first_pixel + finished.first_volume * num_pixels
+    row = jnp.where(finished.valid, row, film.shape[0])
+    return film.at[row].add(film_columns(sums), mode="drop")
+
+
+def flush_host(film: np.ndarray, sums: Sums, finished: Finished, num_pixels: int, first_pixel: int) -> None:
+    """The same in place with numpy, touching only finished lanes: XLA's scatter on the CPU pays for all of them."""
+    lane = np.flatnonzero(np.asarray(finished.valid))
+    if not lane.size:
+        return
+    columns = film_columns(tuple(None if s is None else np.asarray(s)[lane] for s in sums))
+    pixel, first_volume = np.asarray(finished.pixel)[lane], np.asarray(finished.first_volume)[lane]
+    row = pixel - first_pixel + first_volume * num_pixels
+    while lane.size:  # rounds without repeated rows: `+=` keeps only one of those
+        _, first = np.unique(row, return_index=True)
+        film[row[first]] += columns[first]
+        rest = np.ones(row.size, bool)
+        rest[first] = False
+        row, columns, lane = row[rest], columns[rest], lane[rest]

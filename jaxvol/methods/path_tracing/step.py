@@ -7,7 +7,7 @@ equi-angular with free-flight distances, by the balance heuristic (Veach 1997; K
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Int, UInt
 
 from jaxvol import lights, materials, ray_casting, sampling
 from jaxvol.methods.path_tracing import flight as flights
@@ -22,8 +22,8 @@ from jaxvol.methods.path_tracing.lanes import (
     Segment,
     Settings,
     Shadow,
+    Sums,
     add_to_group,
-    flush,
     group_after,
 )
 from jaxvol.methods.path_tracing.tracking import path_spans, shadow_spans, take_off, track
@@ -42,9 +42,16 @@ class Work(eqx.Module):
     num_pixels: int = eqx.field(static=True)
 
 
+class Ended(eqx.Module):
+    """Samples that are complete after a step, with their sums, for the film."""
+
+    sums: Sums
+    finished: Finished
+
+
 def step(
-    scene: Scene, sensor: sensors.Sensor, settings: Settings, seed, lanes: Lanes, casts: Casts, work: Work, film
-) -> tuple[Lanes, Work, Float[Array, "rows columns"]]:
+    scene: Scene, sensor: sensors.Sensor, settings: Settings, seed, lanes: Lanes, casts: Casts, work: Work
+) -> tuple[Lanes, Work, Ended]:
     """Advance every lane by one event (or by a few tentative collisions towards it)."""
     if settings.tracked:
         lanes, through = track(scene, settings, seed, lanes, casts)
@@ -54,14 +61,23 @@ def step(
     pending = jnp.zeros(lanes.alive.shape, bool)
     for shadow in lanes.shadows:
         pending = pending | shadow.active
-    film = flush(film, lanes.finished, ~pending, work.num_pixels)
-    lanes = eqx.tree_at(lambda x: x.finished.valid, lanes, lanes.finished.valid & pending)
+    complete = lanes.finished.valid & ~pending
+    ended = Ended(lanes.sums, eqx.tree_at(lambda f: f.valid, lanes.finished, complete))
+    lanes = eqx.tree_at(
+        lambda x: (x.finished.valid, x.sums),
+        lanes,
+        (
+            lanes.finished.valid & pending,
+            tuple(None if s is None else jnp.where(complete[:, None], 0.0, s) for s in lanes.sums),
+        ),
+        is_leaf=lambda x: x is None,
+    )
     ready = lanes.alive & ~pending
     if settings.tracked:
         ready = ready & ((lanes.flight.stage == ARRIVED) | lanes.starting)
-    lanes, ended = _event(scene, sensor, settings, seed, lanes, casts, ready)
-    lanes, work = _refill(sensor, settings, seed, lanes, ended, work)
-    return lanes, work, film
+    lanes, dead = _event(scene, sensor, settings, seed, lanes, casts, ready)
+    lanes, work = _refill(sensor, settings, seed, lanes, dead, work)
+    return lanes, work, ended
 
 
 def _closed_form_transmittance(scene, settings, lanes, casts):
@@ -78,14 +94,12 @@ def _closed_form_transmittance(scene, settings, lanes, casts):
 
 def _resolve_shadows(lanes, casts, through):
     """Add what lights contribute through the shadow rays that are done."""
-    sums, late, shadows = lanes.sums, lanes.finished.sums, []
+    sums, shadows = lanes.sums, []
     for shadow, blocked, (transmittance, done) in zip(lanes.shadows, casts.blocked, through, strict=True):
         value = shadow.contribution if transmittance is None else shadow.contribution * transmittance
-        value = jnp.where((done & ~blocked)[:, None], value, 0.0)
-        sums = add_to_group(sums, shadow.group, jnp.where(shadow.of_finished[:, None], 0.0, value))
-        late = add_to_group(late, shadow.group, jnp.where(shadow.of_finished[:, None], value, 0.0))
+        sums = add_to_group(sums, shadow.group, jnp.where((done & ~blocked)[:, None], value, 0.0))
         shadows.append(eqx.tree_at(lambda s: s.active, shadow, shadow.active & ~done))
-    return eqx.tree_at(lambda x: (x.sums, x.finished.sums, x.shadows), lanes, (sums, late, tuple(shadows)))
+    return eqx.tree_at(lambda x: (x.sums, x.shadows), lanes, (sums, tuple(shadows)), is_leaf=lambda x: x is None)
 
 
 def _arrive(scene, settings, lanes, casts, ready, u) -> Arrival:
@@ -263,14 +277,13 @@ def _scatter(scene, lanes, arrival, surface, u):
 
 
 def _refill(sensor, settings, seed, lanes, ended, work):
-    """Move ended samples to `finished` and start the next work items in their lanes."""
+    """Note ended samples in `finished` and start the next work items in their lanes."""
     free = ended | ~lanes.alive
     for shadow in lanes.shadows:  # a sample still in `finished` must leave before the lane is used again
         free = free & (ended | ~shadow.active)
     finished = lanes.finished
     pick = lambda new, old: jnp.where(ended[:, None] if new.ndim == 2 else ended, new, old)  # noqa: E731
     finished = Finished(
-        sums=tuple(None if old is None else pick(new, old) for new, old in zip(lanes.sums, finished.sums, strict=True)),
         pixel=pick(lanes.pixel, finished.pixel),
         sample=pick(lanes.sample, finished.sample),
         first_volume=pick(lanes.first_volume, finished.first_volume),
@@ -301,7 +314,7 @@ def _refill(sensor, settings, seed, lanes, ended, work):
         first_volume=new(False, lanes.first_volume),
         last_volume=new(False, lanes.last_volume),
         event=new(jnp.uint32(1), lanes.event),
-        sums=tuple(None if s is None else jnp.where((start | ended)[:, None], 0.0, s) for s in lanes.sums),
+        sums=lanes.sums,
         shadows=shadows,
         finished=finished,
         flight=lanes.flight,
