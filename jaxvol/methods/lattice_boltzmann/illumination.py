@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxvol.methods.lattice_boltzmann import light_rays, marching, preconditioner
+from jaxvol.methods.lattice_boltzmann import fine_sweeps, light_rays, marching, preconditioner
 from jaxvol.methods.lattice_boltzmann import materials as material_pass
 from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice
 from jaxvol.methods.lattice_boltzmann.materials import Materials
@@ -57,7 +57,7 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
         wall = ~(materials.body if materials.body is not None else jnp.any(materials.scattering + materials.absorption > 0, axis=0))
     if plan.solve:
         results = [
-            solve_channel(materials.scattering[c], materials.absorption[c], deposit[c], first[c], wall, plan.internal_reflectance, plan=plan)
+            _channel(materials.scattering[c], materials.absorption[c], deposit[c], first[c], wall, plan)
             for c in range(plan.num_channels)
         ]
         from_volume, scattered, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
@@ -98,15 +98,46 @@ def _channels(power, num_channels):
     return power.mean(1, keepdims=True), spectrum
 
 
-def _solve_channel(scattering, absorption, deposit, first, wall, reflectance, *, plan):
-    directions = lattice(plan.lattice)
-    co = coefficients(directions, scattering, absorption, kind=plan.probability_map, wall=wall, wall_reflectance=reflectance)
+def _channel(scattering, absorption, deposit, first, wall, plan):
+    """(fluence of light scattered once, scattered at all, applications, residual, converged) of one channel."""
     if wall is not None:
         deposit, first = (jnp.where(wall, 0.0, x) for x in (deposit, first))
+    if not plan.corrections:
+        answer = solve_channel(scattering, absorption, deposit, wall, plan.internal_reflectance, plan=plan)
+        from_volume = answer.phi_first if not plan.num_surface_rays else lattice_transport(scattering, absorption, first, wall, plan=plan)
+        return from_volume, answer.phi, answer.num_applications, answer.residual, answer.converged
+    extinction = scattering + absorption
+    phi = jnp.zeros_like(deposit)
+    applications, residual, converged = jnp.zeros((), jnp.int32), jnp.zeros(()), jnp.asarray(True)
+    once = None
+    for _ in range(1 + plan.corrections):
+        arriving = fine_transport(extinction, scattering * phi + deposit)
+        once = arriving if once is None else once
+        defect = arriving - phi
+        # an error of the correction weighs as much less as the defect is smaller than the light itself
+        share = jnp.sqrt(jnp.sum(defect * defect) / jnp.maximum(jnp.sum(arriving * arriving), 1e-30))
+        answer = solve_channel(scattering, absorption, scattering * defect, None, 0.0, plan=plan)
+        phi = phi + defect + answer.phi
+        applications = applications + answer.num_applications
+        residual = jnp.maximum(residual, share * answer.residual)
+        converged = converged & answer.converged
+    from_volume = fine_transport(extinction, first) if plan.num_surface_rays else once
+    return from_volume, phi, applications, residual, converged
+
+
+def _solve_channel(scattering, absorption, deposit, wall, reflectance, *, plan):
+    directions = lattice(plan.lattice)
+    co = coefficients(directions, scattering, absorption, kind=plan.probability_map, wall=wall, wall_reflectance=reflectance)
     levels = preconditioner.build(deposit.shape, scattering + absorption, absorption) if plan.preconditioned else None
-    answer = solve(directions, co, deposit, tolerance=plan.tolerance, max_steps=plan.max_applications, levels=levels)
-    from_volume = transport(directions, co, first) if plan.num_surface_rays else answer.phi_first
-    return from_volume, answer.phi, answer.num_applications, answer.residual, answer.converged
+    return solve(directions, co, deposit, tolerance=plan.tolerance, max_steps=plan.max_applications, levels=levels)
+
+
+def _lattice_transport(scattering, absorption, source, wall, *, plan):
+    directions = lattice(plan.lattice)
+    co = coefficients(directions, scattering, absorption, kind=plan.probability_map, wall=wall)
+    return transport(directions, co, source)
 
 
 solve_channel = jax.jit(_solve_channel, static_argnames="plan")
+lattice_transport = jax.jit(_lattice_transport, static_argnames="plan")
+fine_transport = jax.jit(fine_sweeps.transport)

@@ -9,6 +9,7 @@ from jaxvol import media
 from jaxvol.layers import Claim
 from jaxvol.methods.lattice_boltzmann import fresnel
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES
+from jaxvol.methods.lattice_boltzmann.marching import STEPS
 from jaxvol.methods.lattice_boltzmann.materials import body_bounds, reduced_sigma, regions
 from jaxvol.types import Camera, Scene
 
@@ -28,7 +29,7 @@ class Plan:
     num_channels: int  # 1 when medium and lights are of one spectrum
     refract: bool
     filter_width: float  # voxels, of the Gaussian over the index
-    integrator: str  # "leapfrog" or "euler"
+    integrator: str  # "leapfrog", "smooth" or "euler"
     march_step: float  # voxels, along bent rays
     view_step: float  # voxels
     rays_per_voxel: float  # light rays per voxel face across a beam
@@ -36,6 +37,7 @@ class Plan:
     samples_per_pixel: int
     tolerance: float  # relative residual of the lattice
     max_applications: int
+    corrections: int  # of the lattice's angular error by sweeps along 80 directions
     solve: bool  # False: nothing scatters, the lattice stays dark
     preconditioned: bool
     internal_reflectance: float  # of the body's surface, for the lattice; 0 = open faces
@@ -79,7 +81,7 @@ def plan(
     probability_map: str = "auto",
     resolution: int = 64,
     filter_width: float = 1.0,
-    integrator: str = "leapfrog",
+    integrator: str = "auto",
     march_step: float = 0.5,
     view_step: float = 1.0,
     rays_per_voxel: float = 4.0,
@@ -87,6 +89,7 @@ def plan(
     samples_per_pixel: int = 4,
     tolerance: float = 1e-4,
     max_applications: int = 200,
+    corrections: int | None = None,
     preconditioned: bool = True,
     boundary_reflectance: float | None = None,
     specialize: str = "values",
@@ -107,6 +110,7 @@ def plan(
         "samples_per_pixel": (samples_per_pixel, 1, 4096),
         "tolerance": (tolerance, 1e-7, 0.1),
         "max_applications": (max_applications, 1, 100_000),
+        "corrections": (corrections or 0, 0, 10),
     }
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
@@ -128,12 +132,20 @@ def plan(
         skipped.append(f"warning: sigma_t' h = {thickest:.2g} is coarse for the lattice; resolution = {enough} would bring it to {_THICK:g}")
     if probability_map == "auto":
         probability_map = "exp" if thickest > 2.0 else "pade"
+    if integrator == "auto":
+        # an index given on a grid, without a boundary, varies smoothly; steps at surfaces want the projection
+        smooth = all(p.ior is None or np.ndim(p.ior) == 3 for p in regions(scene.medium)) and scene.medium.boundary is None
+        integrator = "smooth" if refract and smooth else "leapfrog"
     solve = not (by_value and float(scattering.max()) == 0.0)
     if not solve:
         skipped.append("nothing scatters: no lattice")
     internal = boundary_reflectance
     if internal is None:
         internal = fresnel.diffuse_internal(float(np.max(np.asarray(scene.medium.ior)))) if refract and scene.medium.ior is not None else 0.0
+    if corrections is None:
+        corrections = 2 if lattice == "26" and internal == 0 else 0
+    if corrections and internal > 0:
+        raise ValueError(f"corrections = {corrections} need open faces, but boundary_reflectance is {internal:.3g}; allowed: 0")
     isotropic = media.is_isotropic(scene.medium)
     if not isotropic:
         skipped.append("anisotropic scattering by similarity: orders of scattering are not split")
@@ -153,6 +165,7 @@ def plan(
         samples_per_pixel=samples_per_pixel,
         tolerance=tolerance,
         max_applications=max_applications,
+        corrections=corrections,
         solve=solve,
         preconditioned=preconditioned,
         internal_reflectance=float(internal),
@@ -165,7 +178,7 @@ def _check(scene, lattice, probability_map, integrator, specialize, boundary_ref
     allowed = {
         "lattice": (lattice, tuple(LATTICES)),
         "probability_map": (probability_map, ("auto", "pade", "exp")),
-        "integrator": (integrator, ("leapfrog", "euler")),
+        "integrator": (integrator, ("auto", *STEPS)),
         "specialize": (specialize, ("values", "structure")),
     }
     for name, (value, choices) in allowed.items():
