@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxvol import media, phase
 from jaxvol.methods.instant_multiple_scattering import pairs
@@ -62,16 +62,17 @@ def lobe(exponent: Float[Array, "*n"], cos_theta: Float[Array, "*n"]) -> Float[A
     return jnp.where(cos_theta > 0, jnp.exp(exponent * jnp.log(safe)), 0.0)
 
 
-def leaving(light: Light, w: Vector, medium: Medium | None, *, isotropic: bool) -> Vector:
-    """Radiance weight times emitter cosine that a light sends along the unit direction w, RGB."""
+def leaving(
+    light: Light, w: Vector, medium: Medium | None, *, isotropic: bool
+) -> tuple[Vector, Float[Array, "*n"] | float]:
+    """What a light sends along the unit direction w, as RGB and a factor: radiance weight times emitter cosine."""
     if light.normal is None:
-        f = phase_value(medium, pairs.dot(light.direction, w), isotropic=isotropic)
-        return tuple(s * f for s in light.strength)
+        return light.strength, phase_value(medium, pairs.dot(light.direction, w), isotropic=isotropic)
     cosine = jnp.maximum(pairs.dot(light.normal, w), 0.0)
     if light.specular is None:
-        return tuple(s * cosine for s in light.strength)
+        return light.strength, cosine
     glossy = lobe(light.exponent, pairs.dot(light.direction, w))
-    return tuple((s + k * glossy) * cosine for s, k in zip(light.strength, light.specular, strict=True))
+    return tuple(s + k * glossy for s, k in zip(light.strength, light.specular, strict=True)), cosine
 
 
 def scattered(points: Points, towards: Vector, medium: Medium | None, *, isotropic: bool) -> Vector:
@@ -99,12 +100,16 @@ def scattered(points: Points, towards: Vector, medium: Medium | None, *, isotrop
     return tuple(jnp.where(points.on_surface, f * cosine, v) for f, v in zip(brdf, value, strict=True))
 
 
-def extinguish(value: Vector, sigma_t: Vector, column: Float[Array, "*n"], *, grey: bool) -> Vector:
-    """value * exp(-sigma_t column) per channel; one exponential when `grey`."""
+def extinguish(
+    value: Vector, scale: Float[Array, "*n"], sigma_t: Vector, column: Float[Array, "*n"], *, grey: bool
+) -> Vector:
+    """value * scale * exp(-sigma_t column) per channel; one exponential when `grey`."""
     if grey:
-        tau = jnp.exp(-sigma_t[0] * column)
-        return tuple(v * tau for v in value)
-    return tuple(v * jnp.exp(-s * column) for v, s in zip(value, sigma_t, strict=True))
+        # The barrier keeps XLA from computing the factor again in each channel's loop.
+        factor = lax.optimization_barrier(scale * jnp.exp(-sigma_t[0] * column))
+        return tuple(v * factor for v in value)
+    scale = lax.optimization_barrier(scale)
+    return tuple(v * scale * jnp.exp(-s * column) for v, s in zip(value, sigma_t, strict=True))
 
 
 class RayPoint(NamedTuple):
@@ -132,10 +137,15 @@ def choose_point(
     return RayPoint(t + t_closest, weight, (h2 + t * t) * inverse, towards)
 
 
-def shifted(u: Float[Array, "n"], index: Array) -> Float[Array, "n"]:
-    """u of the receiver turned by the light's share of the golden section: every light meets a ray elsewhere."""
-    shift = index.astype(jnp.uint32) * jnp.uint32(2654435769)
-    v = u + (shift >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+def golden(index: Int[Array, "m"]) -> Float[Array, "m"]:
+    """Multiples of the golden section, modulo 1: how far the light with this index turns a receiver's u."""
+    turned = jnp.asarray(index).astype(jnp.uint32) * jnp.uint32(2654435769)
+    return (turned >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+
+
+def shifted(u: Float[Array, "n"], shift: Float[Array, ""]) -> Float[Array, "n"]:
+    """u turned by `shift`, modulo 1: every light meets a ray elsewhere."""
+    v = u + shift
     return v - jnp.floor(v)
 
 
@@ -145,14 +155,14 @@ def add(total: Vector, value: Vector) -> Vector:
 
 
 def _sum_over(function, lights, lanes):
-    """Sum of function(light, index) over all lights; a scan whose body holds several lights."""
+    """Sum of function(light, shift) over all lights; a scan whose body holds several lights."""
     zero = jnp.zeros(lanes, jnp.float32)
     number = lights.position.shape[0]
 
     def body(total, item):
         return add(total, function(*item)), None
 
-    items = (rows(lights), jnp.arange(number, dtype=jnp.int32))
+    items = (rows(lights), golden(jnp.arange(number)))
     total, _ = lax.scan(body, (zero, zero, zero), items, unroll=_UNROLL)
     return jnp.stack(total, axis=-1)
 
@@ -177,16 +187,16 @@ def gather_segments(
     origin, direction = pairs.components(segments.origin), pairs.components(segments.direction)
     sigma_t = pairs.components(media.sigma_t(medium))
 
-    def evaluate(light, index):
+    def evaluate(light, shift):
         total = None
         for k in range(num_evaluations):
-            v = (shifted(u, index) + k) * (1.0 / num_evaluations)
+            v = (shifted(u, shift) + k) * (1.0 / num_evaluations)
             point = choose_point(origin, direction, segments, light.position, v, stratified=stratified)
             f = phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
-            scale = point.weight * f * (1.0 / num_evaluations)
-            value = tuple(x * scale for x in leaving(light, point.towards, medium, isotropic=isotropic))
+            sent, factor = leaving(light, point.towards, medium, isotropic=isotropic)
+            scale = point.weight * (factor * f * (1.0 / num_evaluations))
             column = point.distance + (point.t - segments.t0)
-            value = extinguish(value, sigma_t, column, grey=grey)
+            value = extinguish(sent, scale, sigma_t, column, grey=grey)
             total = value if total is None else add(total, value)
         return total
 
@@ -202,15 +212,15 @@ def gather_points(
     position = pairs.components(points.position)
     sigma_t = pairs.components(media.sigma_t(medium))
 
-    def evaluate(light, index):
+    def evaluate(light, _):
         delta = tuple(x - v for x, v in zip(position, light.position, strict=True))
         r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
         inverse = lax.rsqrt(r2)
         towards = tuple(d * inverse for d in delta)
-        sent = leaving(light, towards, medium, isotropic=isotropic)
+        sent, factor = leaving(light, towards, medium, isotropic=isotropic)
         received = scattered(points, towards, medium, isotropic=isotropic)
-        scale = pairs.inverse_square(r2, points.clamp)
-        value = tuple(a * b * scale for a, b in zip(sent, received, strict=True))
-        return extinguish(value, sigma_t, r2 * inverse, grey=grey)
+        scale = pairs.inverse_square(r2, points.clamp) * factor
+        value = tuple(a * b for a, b in zip(sent, received, strict=True))
+        return extinguish(value, scale, sigma_t, r2 * inverse, grey=grey)
 
     return _sum_over(evaluate, lights, points.position.shape[:1])

@@ -67,30 +67,30 @@ def _deal(lights, num_groups):
     def deal(x):
         return jnp.pad(x, (0, pad)).reshape(size, num_groups).T
 
-    index = jnp.arange(size * num_groups, dtype=jnp.int32).reshape(size, num_groups).T
-    return jax.tree.map(deal, gathering.rows(lights)), jnp.minimum(index, number - 1)
+    index = jnp.minimum(jnp.arange(size * num_groups, dtype=jnp.int32), number - 1).reshape(size, num_groups).T
+    return jax.tree.map(deal, gathering.rows(lights)), index, gathering.golden(index)
 
 
 def _pick(estimate, lights, u, num_groups, num_payload):
-    """Run the reservoirs: estimate(light, index) -> (value, payload)."""
+    """Run the reservoirs: estimate(light, shift) -> (value, payload)."""
     zero = jnp.zeros_like(u)
 
     def group(_, item):
-        members, indices, k = item
-        start = gathering.shifted(u, k * 7919 + 1)
+        members, indices, shifts, start = item
+        start = gathering.shifted(u, start)
         empty = _Reservoir(zero, zero, jnp.zeros(u.shape, jnp.int32), (zero,) * num_payload, start)
 
         def member(reservoir, row):
-            light, index = row
-            value, payload = estimate(light, index)
+            light, index, shift = row
+            value, payload = estimate(light, shift)
             return _offer(reservoir, value, index, payload), None
 
-        kept, _ = lax.scan(member, empty, (members, indices), unroll=2)
+        kept, _ = lax.scan(member, empty, (members, indices, shifts), unroll=2)
         scale = jnp.where(kept.total > 0, kept.total / jnp.maximum(kept.estimate, 1e-37), 0.0)
         return None, (kept.light, scale, *kept.payload)
 
-    members, indices = _deal(lights, num_groups)
-    return lax.scan(group, None, (members, indices, jnp.arange(num_groups, dtype=jnp.int32)))[1]
+    starts = gathering.golden(7919 * jnp.arange(num_groups) + 1)
+    return lax.scan(group, None, (*_deal(lights, num_groups), starts))[1]
 
 
 def _mean(value):
@@ -129,11 +129,11 @@ def pick_for_segments(
         flat = source.reshape(-1)
         lanes = jnp.arange(u.shape[0])
 
-    def estimate(light, index):
-        v = gathering.shifted(u, index)
+    def estimate(light, shift):
+        v = gathering.shifted(u, shift)
         point = gathering.choose_point(origin, direction, segments, light.position, v, stratified=stratified)
-        value = _mean(gathering.leaving(light, point.towards, medium, isotropic=isotropic))
-        value = value * point.weight
+        sent, factor = gathering.leaving(light, point.towards, medium, isotropic=isotropic)
+        value = _mean(sent) * factor * point.weight
         value = value * gathering.phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
         along = point.t - segments.t0
         depth = sigma * mean_density * point.distance
@@ -163,12 +163,12 @@ def pick_for_points(
     position = pairs.components(points.position)
     sigma = 0.0 if medium is None else jnp.mean(media.sigma_t(medium)) * _mean_density(medium)
 
-    def estimate(light, index):
+    def estimate(light, _):
         delta, r2, inverse, towards = _between(position, light.position)
-        sent = _mean(gathering.leaving(light, towards, medium, isotropic=isotropic))
+        sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
         received = _mean(gathering.scattered(points, towards, medium, isotropic=isotropic))
         bounded = pairs.inverse_square(r2, points.clamp)
-        value = sent * received * bounded * jnp.exp(-jnp.minimum(sigma * r2 * inverse, _THICKEST))
+        value = _mean(sent) * factor * received * bounded * jnp.exp(-jnp.minimum(sigma * r2 * inverse, _THICKEST))
         return value, (bounded,)
 
     light, scale, bounded = _pick(estimate, lights, u, num_groups, 1)
@@ -231,10 +231,10 @@ def evaluate_segments(
         scale = weight * f * media.density(medium, x)
         if seen is not None:
             scale = scale * seen
-        sent = gathering.leaving(light, towards, medium, isotropic=isotropic)
+        sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
         column = receivers.column_between(medium, x, jnp.stack(light.position, -1), num_steps=num_steps)
         column = column + receivers.column_at(segments, t)
-        value = gathering.extinguish(tuple(s * scale for s in sent), sigma_t, column, grey=False)
+        value = gathering.extinguish(sent, scale * factor, sigma_t, column, grey=False)
         return gathering.add(total, value), None
 
     zero = jnp.zeros_like(segments.t0)
@@ -262,13 +262,15 @@ def evaluate_points(
         light: Light = _chosen(lights, index)
         _, _, _, towards = _between(position, light.position)
         scale = weight if seen is None else weight * seen
-        sent = gathering.leaving(light, towards, medium, isotropic=isotropic)
+        sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
+        scale = scale * factor
         received = gathering.scattered(points, towards, medium, isotropic=isotropic)
-        value = tuple(a * b * scale for a, b in zip(sent, received, strict=True))
-        if medium is not None:
-            ends = jnp.stack(light.position, -1)
-            column = receivers.column_between(medium, points.position, ends, num_steps=num_steps)
-            value = gathering.extinguish(value, pairs.components(media.sigma_t(medium)), column, grey=False)
+        value = tuple(a * b for a, b in zip(sent, received, strict=True))
+        if medium is None:
+            return gathering.add(total, tuple(v * scale for v in value)), None
+        ends = jnp.stack(light.position, -1)
+        column = receivers.column_between(medium, points.position, ends, num_steps=num_steps)
+        value = gathering.extinguish(value, scale, pairs.components(media.sigma_t(medium)), column, grey=False)
         return gathering.add(total, value), None
 
     zero = jnp.zeros(points.position.shape[:1], jnp.float32)

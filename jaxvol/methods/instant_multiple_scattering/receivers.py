@@ -16,7 +16,7 @@ class Segments(eqx.Module):
     direction: Float[Array, "n 3"]
     t0: Float[Array, "n"]
     t1: Float[Array, "n"]
-    clamp: Float[Array, "n"] | None  # least clamp distance along the ray; None = unclamped
+    clamp: Float[Array, ""] | None  # least clamp distance along the rays; None = unclamped
     column: Float[Array, "s n"] | None = None  # of density from t0 to the ends of s equal steps; None = homogeneous
 
 

@@ -65,8 +65,7 @@ def _segments(scene, mip, origin, direction, t_end, *, plan):
     clamp = None
     if plan.mean_free_paths is not None:
         thickest = jnp.mean(media.sigma_t(medium)) * (1.0 if mip is None else jnp.max(mip))
-        least = compensation.clamp_distance(thickest, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
-        clamp = jnp.broadcast_to(least, t0.shape)
+        clamp = compensation.clamp_distance(thickest, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
     segments = Segments(origin, direction, t0, t1, clamp)
     if medium.density is None:
         return segments

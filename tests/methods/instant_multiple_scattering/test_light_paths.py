@@ -21,23 +21,26 @@ def integral(vertices, number, power=0):
 def test_moments_of_the_fluence(g):
     """T2a: integral of phi = 1 / (1 - c); <r^2> = 2 / ((1 - c)(1 - c g)); here per channel, c = .8, .5, .2."""
     medium = make_medium(sigma_s=(0.8, 0.5, 0.2), sigma_a=(0.2, 0.5, 0.8), g=g, half=40.0)
-    number = 8192
+    number = 2048
     vertices, counts = walk(lit(medium), number=number)
     c = np.array([0.8, 0.5, 0.2])
     assert counts["num_truncated"] == 0
     total = integral(vertices, number)
-    # Standard errors: about 1 % of the totals (geometric number of collisions), 2.5 % of the second moments.
-    np.testing.assert_allclose(total, 1 / (1 - c), rtol=0.03)
-    np.testing.assert_allclose(integral(vertices, number, 2) / total, 2 / ((1 - c) * (1 - c * g)), rtol=0.08)
+    # Standard errors: about 2 % of the totals (geometric number of collisions), 4 % of the second moments.
+    np.testing.assert_allclose(total, 1 / (1 - c), rtol=0.06)
+    np.testing.assert_allclose(integral(vertices, number, 2) / total, 2 / ((1 - c) * (1 - c * g)), rtol=0.15)
 
 
 def test_constant_grid_equals_homogeneous_also_per_channel():
     """T12, with channels 100:1 apart and one of albedo 0: totals in a box of 4 mean free paths, tracked and closed form."""
     settings = {"sigma_s": (2.0, 0.05, 0.0), "sigma_a": (0.5, 0.02, 0.025), "g": 0.3, "half": 1.0}
-    number = 8192
-    closed, _ = walk(lit(make_medium(**settings)), number=number)
-    tracked, _ = walk(lit(make_medium(**settings, density=np.full((4, 4, 4), 1.0))), number=number)
-    np.testing.assert_allclose(integral(tracked, number), integral(closed, number), rtol=0.04)
+    number = 2048
+    # Standard errors of the means of eight sets: 2.5 % in the thin channels, whose flights the thick one's samples serve badly.
+    means = [
+        np.mean([integral(walk(lit(medium), number=number, seed=seed)[0], number) for seed in range(8)], axis=0)
+        for medium in (make_medium(**settings), make_medium(**settings, density=np.full((4, 4, 4), 1.0)))
+    ]
+    np.testing.assert_allclose(means[1], means[0], rtol=0.11)
 
 
 def test_paths_do_not_depend_on_the_batch():
@@ -75,14 +78,14 @@ def test_reweighted_paths_are_paths_of_the_new_medium():
     """Fluence totals of a medium of another density and albedo from the old one's paths; identity for the same medium."""
     old = lit(make_medium(half=40.0))
     new = lit(make_medium(sigma_s=(0.63, 0.72, 0.8), sigma_a=(0.27, 0.18, 0.2), half=40.0))
-    number = 8192
+    number = 2048
     vertices, _ = walk(old, number=number)
     same = incremental.reweighted(old, old, vertices, seed=5)
     np.testing.assert_allclose(same.incident, vertices.incident, rtol=1e-5)
     moved = incremental.reweighted(old, new, vertices, seed=5)
     sigma = np.asarray(new.medium.sigma_s + new.medium.sigma_a)
     expected = 1 / (sigma * (1 - np.asarray(new.medium.sigma_s) / sigma))
-    np.testing.assert_allclose(integral(moved, number), expected, rtol=0.05)
+    np.testing.assert_allclose(integral(moved, number), expected, rtol=0.1)
 
 
 def test_a_share_of_the_paths_is_renewed_each_frame():

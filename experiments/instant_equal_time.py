@@ -1,0 +1,180 @@
+"""Equal-time comparison with Mitsuba 3's volpath: CPU seconds against relMSE (CSV and a figure).
+
+Both render the whole picture (single scattering included; ours from one equi-angular sample of the light per set of
+virtual lights), on one core. relMSE against a reference R with its own noise removed: mean((I - A)(I - B)) / mean(R^2 + ...)
+with two independent halves A, B of the reference. Needs mitsuba (extra "peer") and, for llvm_ad_rgb, DRJIT_LIBLLVM_PATH.
+Usage: taskset -c 0 python experiments/instant_equal_time.py cube|cube_g|plume [--size 64] [--variant llvm_ad_rgb].
+"""
+
+import argparse
+import os
+import time
+
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+
+import jax.numpy as jnp
+import numpy as np
+from instant_common import SCENES, figure, out_folder, pictures, square_camera, write_csv
+
+from jaxvol import lights as primary
+from jaxvol import media, sampling
+from jaxvol.methods import instant_multiple_scattering as ims
+from jaxvol.methods.instant_multiple_scattering import compensation, rendering, stages
+from jaxvol.methods.instant_multiple_scattering.receivers import Points
+
+SPP = (4, 16, 64, 256)
+OURS = {
+    "full resolution": {},
+    "low resolution": {"upsample": 4, "jitter": False},
+}
+PATHS = (64, 256, 1024, 4096)
+
+
+def mitsuba_scene(scene, size):
+    """The same medium, light and camera for Mitsuba; the medium fills a box without a surface."""
+    import mitsuba as mi
+
+    bounds = np.asarray(scene.medium.bounds)
+    sigma_t = float(media.sigma_t(scene.medium)[0])
+    albedo = float(scene.medium.sigma_s[0]) / sigma_t
+    phase = {"type": "hg", "g": float(scene.medium.g)}
+    to_world = mi.ScalarTransform4f().translate(list(map(float, bounds[0]))).scale(list(map(float, bounds[1] - bounds[0])))
+    if scene.medium.density is None:
+        medium = {"type": "homogeneous", "albedo": albedo, "sigma_t": sigma_t, "phase": phase}
+    else:
+        grid = np.ascontiguousarray(np.transpose(np.asarray(scene.medium.density), (2, 1, 0)))[..., None]
+        volume = {"type": "gridvolume", "grid": mi.VolumeGrid(grid), "to_world": to_world, "wrap_mode": "clamp"}
+        medium = {"type": "heterogeneous", "albedo": albedo, "sigma_t": volume, "scale": sigma_t, "phase": phase}
+    center, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    cube = mi.ScalarTransform4f().translate(list(map(float, center))).scale(list(map(float, half)))
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 1000, "rr_depth": 50, "hide_emitters": True},
+            "sensor": {
+                "type": "perspective",
+                "fov": float(np.degrees(0.6)),
+                "fov_axis": "y",
+                "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 4], target=[0, 0, 0], up=[0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+                "sampler": {"type": "independent"},
+            },
+            "light": {
+                "type": "point",
+                "position": list(map(float, scene.point_lights.position[0])),
+                "intensity": {"type": "rgb", "value": list(map(float, scene.point_lights.intensity[0]))},
+            },
+            "box": {"type": "cube", "to_world": cube, "bsdf": {"type": "null"}, "interior": medium},
+        }
+    )
+
+
+def single_scattering(context, camera, index):
+    """Light scattered once, one equi-angular point (homogeneous) or one transmittance-sampled point per eye ray."""
+    scene = context.scene
+    origin, direction, t, _, _ = rendering.eye_rays(context, camera, index)
+    segments = stages.segments_of(context, origin, direction, t)
+    u = sampling.uniforms(context.seed, sampling.stream("experiment.single"), index, 0)
+    if scene.medium.density is None:
+        t, pdf = sampling.sample_equiangular(
+            u[0], origin, direction, segments.t0, segments.t1, scene.point_lights.position[0]
+        )
+        points = origin + t[:, None] * direction
+        weight = jnp.exp(-(t - segments.t0)[:, None] * media.sigma_t(scene.medium)) / jnp.maximum(pdf, 1e-30)[:, None]
+        points = Points(points, -direction, jnp.broadcast_to(scene.medium.sigma_s, points.shape), None)
+    else:
+        points, weight = stages.eye_vertices(context, segments, u[0])
+        density = media.density(scene.medium, points.position)
+        total = jnp.where(density > 0, 1.0, 0.0)
+        points = Points(points.position, points.outgoing, points.scattering * total[:, None], None)
+    sample = primary.sample_light(scene, points.position, u[1], u[2], u[3])
+    value = compensation.direct_light(
+        scene, points, sample, None, isotropic=context.plan.isotropic, num_steps=max(context.plan.eye_steps, 1)
+    )
+    return jnp.where((segments.t1 > segments.t0)[:, None], weight * value, 0.0)
+
+
+def ours(scene, camera, plan, seed):
+    """The whole picture of one set of lights, and the CPU seconds that it took."""
+    start = time.process_time()
+    images, counts = rendering.render_set(scene, camera, plan, seed=seed, sizes=SIZES.setdefault(plan.num_paths, {}))
+    total = sum(images.values())
+    context = rendering.Context(scene, None, None, mip_of(scene, plan), plan, seed)
+    for k in range(4):
+        context = context._replace(seed=seed * 4 + k)
+        total = total + np.asarray(single_scattering(context, camera, jnp.arange(len(total), dtype=jnp.uint32))) / 4
+    return total, time.process_time() - start, counts
+
+
+SIZES: dict = {}
+
+
+def mip_of(scene, plan):
+    if scene.medium.density is None:
+        return None
+    return jnp.asarray(compensation.coarse_density(scene.medium.density, block=plan.mip_block))
+
+
+def relmse(image, a, b):
+    """Unbiased for the noise of the reference: a and b are its independent halves."""
+    reference = 0.5 * (a + b)
+    return float(np.mean((image - a) * (image - b) / (reference**2 + 0.01 * reference.mean() ** 2)))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", choices=list(SCENES))
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--reference", type=int, default=4096)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--levels", type=int, default=2)
+    arguments = parser.parse_args()
+    import drjit
+    import mitsuba as mi
+
+    mi.set_variant(arguments.variant)
+    drjit.set_thread_count(1)
+    scene, camera = SCENES[arguments.scene](), square_camera(arguments.size)
+    theirs = mitsuba_scene(scene, arguments.size)
+
+    def render(spp, seed):
+        start = time.process_time()
+        image = np.array(mi.render(theirs, spp=spp, seed=seed)).reshape(-1, 3)
+        return image, time.process_time() - start
+
+    halves = [np.mean([render(256, 1000 + 100 * h + k)[0] for k in range(arguments.reference // 512)], axis=0) for h in (0, 1)]
+    rows, kept = [], [0.5 * (halves[0] + halves[1])]
+    for spp in SPP:
+        render(spp, 1)
+        results = [render(spp, 10 + k) for k in range(arguments.repeats)]
+        errors = [relmse(image, *halves) for image, _ in results]
+        rows.append(["mitsuba volpath", spp, np.median([s for _, s in results]), np.mean(errors), results[0][0].mean() / kept[0].mean() - 1])
+        print(*rows[-1], flush=True)
+    for label, options in OURS.items():
+        for number in PATHS:
+            plan = ims.plan(scene, camera, num_paths=number, num_levels=arguments.levels, tile=4096, **options)
+            ours(scene, camera, plan, 1)
+            results = [ours(scene, camera, plan, 10 + k) for k in range(arguments.repeats)]
+            errors = [relmse(image, *halves) for image, _, _ in results]
+            seconds = np.median([s for _, s, _ in results])
+            rows.append([label, number, seconds, np.mean(errors), np.mean([i.mean() for i, _, _ in results]) / kept[0].mean() - 1])
+            print(*rows[-1], results[-1][2], flush=True)
+        kept.append(results[0][0])
+    folder = out_folder()
+    write_csv(folder / f"equal_time_{arguments.scene}.csv", ["method", "samples", "cpu_s", "relmse", "bias"], rows)
+    with figure(folder / f"equal_time_{arguments.scene}.png") as axes:
+        for label in dict.fromkeys(r[0] for r in rows):
+            axes.loglog([r[2] for r in rows if r[0] == label], [r[3] for r in rows if r[0] == label], "o-", label=label)
+        axes.set_xlabel("CPU seconds, one core")
+        axes.set_ylabel("relMSE")
+        axes.legend()
+        axes.set_title(f"{arguments.scene}, {arguments.size}^2")
+    shape = (arguments.size, arguments.size, 3)
+    scale = 0.7 / np.percentile(kept[0], 99)
+    names = ["reference", *OURS]
+    pictures(folder / f"equal_time_{arguments.scene}_pictures.png", [k.reshape(shape) for k in kept], columns=3, scale=scale, titles=names)
+
+
+if __name__ == "__main__":
+    main()
