@@ -102,8 +102,7 @@ def from_json(text: str, *, name: str = "JSON") -> TableFile:
     try:
         content = json.loads(text)
         arrays = {
-            key: np.array(entry["data"], dtype=np.float64).reshape(entry["shape"])
-            for key, entry in content["arrays"].items()
+            key: np.array(entry["data"], dtype=np.float64).reshape(entry["shape"]) for key, entry in content["arrays"].items()
         }
         metadata = content["metadata"]
         claimed = metadata["checksum"]

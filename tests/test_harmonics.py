@@ -15,9 +15,7 @@ def sphere(num=48):
     mu, weight = np.polynomial.legendre.leggauss(num)
     phi = 2 * np.pi * (np.arange(2 * num) + 0.5) / (2 * num)
     sine = np.sqrt(1 - mu**2)
-    direction = np.stack(
-        [np.outer(sine, np.cos(phi)), np.outer(sine, np.sin(phi)), np.outer(mu, np.ones_like(phi))], axis=-1
-    )
+    direction = np.stack([np.outer(sine, np.cos(phi)), np.outer(sine, np.sin(phi)), np.outer(mu, np.ones_like(phi))], axis=-1)
     return direction, np.outer(weight, np.full(2 * num, np.pi / num))
 
 

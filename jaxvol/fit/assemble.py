@@ -125,7 +125,15 @@ _SINGLE = {"point": _single_point, "directional": _single_directional, "area": _
 
 
 def area_source_response(
-    tau, *, moments: np.ndarray, albedo: float, order: int, source_bands: int, first: int = 2, last: int | None = None, kappa=None
+    tau,
+    *,
+    moments: np.ndarray,
+    albedo: float,
+    order: int,
+    source_bands: int,
+    first: int = 2,
+    last: int | None = None,
+    kappa=None,
 ) -> np.ndarray:
     """c_k,lm with L_lm(theta_n) / albedo^first = sum_k c_k,lm y_km(theta_n) of a Lambertian patch: `[T, sources, half]`.
 

@@ -101,9 +101,7 @@ def directional_table(
     return table
 
 
-def bounce_tables(
-    tau, *, moments: np.ndarray, num_bounces: int, order: int = 11, num_streams: int = NUM_STREAMS
-) -> np.ndarray:
+def bounce_tables(tau, *, moments: np.ndarray, num_bounces: int, order: int = 11, num_streams: int = NUM_STREAMS) -> np.ndarray:
     """L_l(tau) of light scattered exactly n times, n = 2..num_bounces, albedo 1: `[bounces - 1, T, order]`.
 
     Radius 0.6, 64 points: aliasing error 0.6^64 = 6e-15 of the response, rounding times 0.6^-n.

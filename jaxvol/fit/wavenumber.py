@@ -261,9 +261,7 @@ def moment_responses(
     num_azimuthal = min(order - 1, max(source_bands)) + 1
     scattered_azimuthal = min(num_azimuthal, moments.size)  # chi_m = 0 beyond: nothing scatters there
     k = np.concatenate([real.astype(complex), *(group[1] for group in groups)])
-    amplitudes = [
-        _amplitudes(k, m, moments, albedo, source_bands, order, first, last) for m in range(scattered_azimuthal)
-    ]
+    amplitudes = [_amplitudes(k, m, moments, albedo, source_bands, order, first, last) for m in range(scattered_azimuthal)]
     response = np.zeros((tau.size, order, len(source_bands), num_azimuthal))
 
     def add(radii, wave, part, weight, inside):

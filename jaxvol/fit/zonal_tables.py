@@ -65,7 +65,9 @@ def point_moment_table(tau, *, order: int = 11, num_moments: int = 16, num_nodes
     """M_{l,j}(tau) of a point source: `[T, order, num_moments]`. Nodes must exceed about twice order + num_moments."""
     nodes = airlight.half_angle_nodes(num_nodes)
     zonal = legvander(nodes.cos_receiver, order - 1) * harmonics.zonal_norm(order)
-    columns = 2 * nodes.weight[:, None, None] * zonal[:, :, None] * _moment_columns(nodes.cos_deflection, num_moments)[:, None, :]
+    columns = (
+        2 * nodes.weight[:, None, None] * zonal[:, :, None] * _moment_columns(nodes.cos_deflection, num_moments)[:, None, :]
+    )
     table = _exponential_sums(_checked(tau), nodes.excess, columns.reshape(nodes.weight.size, -1))
     return table.reshape(-1, order, num_moments)
 
