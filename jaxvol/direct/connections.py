@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 
 from jaxvol import extinction, ray_casting, segments
 from jaxvol.direct.emitters import Emitters, emitters
+from jaxvol.direct.light_columns import LightColumns, light_columns
+from jaxvol.direct.light_columns import optical_thickness as from_columns
 from jaxvol.types import Scene
 
 _NEAR = 1.0 - 1e-4  # shadow rays stop short of a light that is itself a surface
@@ -43,6 +45,7 @@ class LightRun:
     kind: str
     scene: Scene
     emitters: Emitters | None = None  # of the kind "area" when there are few faces
+    columns: LightColumns | None = None  # of the kind "directional" when the medium is one box with a grid
 
 
 @dataclass(frozen=True)
@@ -57,8 +60,9 @@ class Context:
     lights: tuple[LightRun, ...]
 
 
-def light_runs(scene: Scene) -> tuple[LightRun, ...]:
+def light_runs(scene: Scene, marching: extinction.MarchingMedium | None) -> tuple[LightRun, ...]:
     """Every light of the scene by itself; eager."""
+    gridded = marching is not None and segments.is_box(scene.medium) and scene.medium.density is not None
     runs = []
     bare = Scene(mesh=scene.mesh)
     for kind, field in _FIELDS.items():
@@ -71,7 +75,9 @@ def light_runs(scene: Scene) -> tuple[LightRun, ...]:
         else:
             alone = [lights]
         for light in alone:
-            runs.append(LightRun(kind, _with(bare, field, light), emitters(scene) if kind == "area" else None))
+            faces = emitters(scene) if kind == "area" else None
+            columns = light_columns(marching, light.direction[0]) if kind == "directional" and gridded else None
+            runs.append(LightRun(kind, _with(bare, field, light), faces, columns))
     return tuple(runs)
 
 
@@ -81,13 +87,14 @@ def _with(scene, field, value):
 
 def context(scene: Scene, plan: Any, *, caster: ray_casting.Caster = None) -> Context:
     """Casters and tables for a scene; eager. The caster of the mesh may be given."""
+    marching = None if scene.medium is None else extinction.marching_medium(scene.medium)
     return Context(
         scene=scene,
         plan=plan,
         caster=ray_casting.caster_for(scene.mesh) if caster is None else caster,
         medium_casters=segments.medium_casters(scene.medium),
-        marching=None if scene.medium is None else extinction.marching_medium(scene.medium),
-        lights=light_runs(scene),
+        marching=marching,
+        lights=light_runs(scene, marching),
     )
 
 
@@ -112,7 +119,12 @@ def _mask_and_sum(value, lit):
     return jnp.sum(jnp.where(lit[..., None], value, 0.0), axis=0)
 
 
-def resolve(context: Context, connections: Connections) -> Float[Array, "n 3"]:
+@jax.jit
+def _attenuate_by_columns(value, lit, columns, medium, origin):
+    return _attenuate_and_sum(value, lit, from_columns(columns, medium, origin))
+
+
+def resolve(context: Context, run: LightRun, connections: Connections) -> Float[Array, "n 3"]:
     """What arrives over all K connections of each point: shadows cast, the medium's transmittance multiplied in."""
     value = connections.value
     lit = None
@@ -126,6 +138,8 @@ def resolve(context: Context, connections: Connections) -> Float[Array, "n 3"]:
     if context.marching is None:
         return _sum(value) if lit is None else _mask_and_sum(value, lit)
     rays = [x.reshape(-1, *x.shape[2:]) for x in (connections.origin, connections.direction, connections.distance)]
+    if run.columns is not None:
+        return _attenuate_by_columns(value, lit, run.columns, context.marching.regions[0], rays[0])
     if segments.is_box(context.scene.medium) and context.scene.medium.density is None:
         return _attenuate_and_sum(value, lit, _depth(context, *rays))
     # Marching is dear: only connections that still carry light, padded to few different sizes.

@@ -52,7 +52,7 @@ def scattered_light(
     total = jnp.zeros(origin.shape, jnp.float32)
     for run in context.lights:
         for connections in _connections(context, run, cells, origin, direction, pixel, sample, seed, num_samples):
-            total = total + resolve(context, connections)
+            total = total + resolve(context, run, connections)
     result[chosen] = np.asarray(total)[: chosen.size]
     return jnp.asarray(result)
 

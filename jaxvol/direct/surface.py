@@ -31,10 +31,10 @@ def surface_light(
         num_bsdf = 0 if run.kind in DELTA else plan.num_bsdf_samples
         sizes = {"num_light": num_light, "num_bsdf": num_bsdf, "kind": run.kind}
         towards = connect(run.scene, run.emitters, rays.direction, hits, pixel, sample, seed, **sizes)
-        total = total + resolve(context, towards)
+        total = total + resolve(context, run, towards)
         if num_bsdf and run.kind == "environment":
             along = connect_along_bsdf(run.scene, rays.direction, hits, pixel, sample, seed, **sizes)
-            total = total + resolve(context, along)
+            total = total + resolve(context, run, along)
         elif num_bsdf:
             total = total + _area_along_bsdf(context, run, rays.direction, hits, pixel, sample, seed, sizes)
     return total if through is None else total * through
@@ -142,4 +142,6 @@ def _area_along_bsdf(context: Context, run: LightRun, incoming, hits, pixel, sam
     origin, direction, pdf = _casts_along_bsdf(run.scene, incoming, hits, pixel, sample, seed, num_bsdf=num_bsdf)
     t, face = ray_casting.intersect(context.caster, origin, direction, jnp.where(hits.valid, jnp.inf, -1.0))
     counts = {"num_light": num_light, "num_bsdf": num_bsdf}
-    return resolve(context, _weigh_emitters(run.scene, run.emitters, incoming, hits, origin, direction, pdf, t, face, **counts))
+    return resolve(
+        context, run, _weigh_emitters(run.scene, run.emitters, incoming, hits, origin, direction, pdf, t, face, **counts)
+    )
