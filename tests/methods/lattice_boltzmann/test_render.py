@@ -1,0 +1,202 @@
+"""The method as a whole: what it claims, plans, refuses and skips; books, layers, equal ways to say one scene."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from jaxvol import camera as cameras
+from jaxvol.layers import items
+from jaxvol.methods import lattice_boltzmann
+from jaxvol.methods.lattice_boltzmann import fine_sweeps, illumination, light_rays
+from jaxvol.types import Camera, DirectionalLights, Medium, Mesh, PointLights, Rays, Scene
+
+
+def _scene(sigma_s=(2.0, 2.0, 2.0), sigma_a=(0.2, 0.2, 0.2), light=(1.0, 1.0, 1.0), **fields):
+    medium = Medium(
+        bounds=jnp.asarray([[0.0, 0, 0], [1, 1, 1]]),
+        sigma_s=jnp.asarray(sigma_s, jnp.float32),
+        sigma_a=jnp.asarray(sigma_a, jnp.float32),
+        g=fields.pop("g", jnp.float32(0.0)),
+        **fields,
+    )
+    sun = DirectionalLights(jnp.asarray([[0.6, -0.8, 0.0]]), jnp.asarray([light], jnp.float32))
+    return Scene(medium=medium, directional_lights=sun)
+
+
+def _camera(size=8):
+    pose = cameras.look_at([0.5, 0.6, 3.0], [0.5, 0.5, 0.5], [0, 1, 0])
+    return Camera(jnp.asarray(pose), jnp.float32(0.6), size, size)
+
+
+SMALL = {"resolution": 8, "rays_per_voxel": 2.0, "samples_per_pixel": 1}
+
+
+def _picture(scene, **options):
+    plan = lattice_boltzmann.plan(scene, _camera(), **SMALL, **options)
+    return lattice_boltzmann.render(scene, _camera(), plan, seed=0), plan
+
+
+@pytest.fixture(scope="module")
+def grey():
+    return _picture(_scene())
+
+
+def test_layers_are_claimed_and_books_balance(grey):
+    estimate, plan = grey
+    assert plan.num_channels == 1 and any("one spectrum" in reason for reason in plan.skipped)
+    claimed = {claim.name for claim in lattice_boltzmann.claims(_scene())}
+    assert claimed == {"volume_from_light", "volume_from_volume", "volume_from_multiple"}
+    found = dict(items(estimate.mean))
+    assert set(found) == claimed | {"volume_from_surface"}
+    assert not np.any(found["volume_from_surface"]) and all(np.isfinite(v).all() for v in found.values())
+    diagnostics = estimate.diagnostics
+    assert bool(diagnostics["converged"]) and float(diagnostics["residual"].max()) < 2e-4
+    assert float(diagnostics["live"][0]) < 1e-4 * float(diagnostics["sent"][0])
+
+
+def test_three_equal_channels_are_one(grey):
+    """Grey media solve one channel; three channels give the same picture (and the colour of the light is kept)."""
+    three, plan = _picture(_scene(sigma_a=(0.2, 0.2, 0.2000001)))
+    assert plan.num_channels == 3
+    for (name, a), (_, b) in zip(items(grey[0].mean), items(three.mean), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4 * float(np.max(np.asarray(b)) + 1e-9), err_msg=name)
+    coloured, plan = _picture(_scene(light=(2.0, 1.0, 0.5)))
+    assert plan.num_channels == 1
+    expected = np.asarray(grey[0].mean.volume_from_light)[..., :1] * np.array([2.0, 1.0, 0.5])
+    np.testing.assert_allclose(coloured.mean.volume_from_light, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_constant_grid_is_homogeneous(grey):
+    """T12."""
+    gridded, _ = _picture(_scene(density=jnp.ones((8, 8, 8))))
+    for (name, a), (_, b) in zip(items(grey[0].mean), items(gridded.mean), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3 * float(np.max(np.asarray(a)) + 1e-9), err_msg=name)
+
+
+def test_power_scales_the_picture(grey):
+    double, _ = _picture(_scene(light=(2.0, 2.0, 2.0)))
+    np.testing.assert_allclose(double.mean.volume_from_multiple, 2 * np.asarray(grey[0].mean.volume_from_multiple), rtol=1e-4)
+
+
+def test_anisotropic_media_claim_only_the_sum():
+    (claim,) = lattice_boltzmann.claims(_scene(g=jnp.float32(0.5)))
+    assert claim.layers == ("volume_from_light", "volume_from_volume", "volume_from_multiple") and "similarity" in claim.partial
+
+
+def test_nothing_scatters_no_lattice():
+    plan = lattice_boltzmann.plan(_scene(sigma_s=(0.0, 0.0, 0.0)), None, **SMALL)
+    assert not plan.solve and any("nothing scatters" in reason for reason in plan.skipped)
+
+
+def test_coarse_lattice_is_warned_with_the_resolution_that_would_do():
+    plan = lattice_boltzmann.plan(_scene(sigma_s=(40.0, 40.0, 40.0)), None, **SMALL)
+    (warning,) = [reason for reason in plan.skipped if reason.startswith("warning")]
+    assert "resolution = 41" in warning and plan.probability_map == "exp"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"lattice": "19"}, "lattice = '19' must be one of paper, 18, 26"),
+        ({"filter_width": 0.3}, "filter_width = 0.3 must be within"),
+        ({"march_step": 1.5}, "march_step = 1.5 must be within"),
+        ({"probability_map": "linear"}, "probability_map"),
+        ({"boundary_reflectance": 1.2}, "must be within"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        lattice_boltzmann.plan(_scene(), None, **(SMALL | options))
+
+
+def test_closed_white_box_is_refused_with_the_reason():
+    scene = _scene(sigma_a=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="no steady state"):
+        lattice_boltzmann.plan(scene, None, **SMALL, boundary_reflectance=1.0)
+    assert lattice_boltzmann.plan(scene, None, **SMALL).solve  # an open one of albedo 1 works
+
+
+def test_missing_medium():
+    assert lattice_boltzmann.claims(Scene()) == ()
+    with pytest.raises(ValueError, match="medium is missing"):
+        lattice_boltzmann.plan(Scene(), None)
+
+
+def test_light_rays_carry_the_lights_power():
+    low, high = np.zeros(3), np.ones(3)
+    sun = _scene()
+    rays = light_rays.from_lights(sun, low, high, 0.1, rays_per_voxel=4.0, seed=0)
+    # the cube's cross-section facing (0.6, -0.8, 0) is 1.4 of irradiance 1
+    assert rays.power[:, 0].sum() == pytest.approx(1.4, rel=0.03)
+    bulb = Scene(medium=sun.medium, point_lights=PointLights(jnp.asarray([[0.5, 0.5, 0.5]]), jnp.ones((1, 3))))
+    inside = light_rays.from_lights(bulb, low, high, 0.1, rays_per_voxel=4.0, seed=0)
+    assert inside.power[:, 0].sum() == pytest.approx(4 * np.pi, rel=1e-5)
+
+
+def test_shadows_cut_light_rays():
+    wall = trimesh.creation.box(extents=[0.02, 8.0, 8.0])
+    wall.apply_translation([-0.5, 0.0, 0.0])
+    mesh = Mesh(jnp.asarray(wall.vertices, jnp.float32), jnp.asarray(wall.faces), jnp.zeros((len(wall.faces), 3)))
+    scene = eqx.tree_at(lambda s: s.mesh, _scene(), mesh, is_leaf=lambda x: x is None)
+    scene = eqx.tree_at(lambda s: s.directional_lights.direction, scene, jnp.asarray([[1.0, 0.0, 0.0]]))
+    plan = lattice_boltzmann.plan(scene, None, **SMALL)
+    light = lattice_boltzmann.illuminate(scene, plan)
+    assert float(jnp.max(light.from_light)) == 0.0
+
+
+def test_quadrature_of_the_fine_sweeps():
+    points = fine_sweeps.directions()
+    vectors, weights = np.array([v for v, _ in points]), np.array([w for _, w in points])
+    assert len(points) == 40 and 2 * weights.sum() == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-6)
+    assert 2 * np.sum(weights * vectors[:, 0] ** 4) == pytest.approx(1 / 5, abs=2e-4)
+
+
+def test_fine_sweeps_against_straight_integration():
+    """Fluence in the middle of a uniform source with absorption, against the integral over directions in float64."""
+    n, x = 12, 0.3
+    phi = fine_sweeps.transport(jnp.full((n,) * 3, x), jnp.ones((n,) * 3))
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(20000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    center = np.full(3, n / 2)
+    length = np.min(np.where(directions > 0, n - center, center) / np.abs(directions), axis=1)
+    expected = np.mean((1 - np.exp(-x * length)) / x)
+    assert float(np.mean(np.asarray(phi)[5:7, 5:7, 5:7])) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.slow
+def test_refraction_radiance_over_all_exits_and_absorption_make_the_input():
+    """The 1/n^2 law and internal reflection belong together: a sphere of index 1.5 gives back what it does not absorb."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    boundary = Mesh(jnp.asarray(ball.vertices, jnp.float32), jnp.asarray(ball.faces), jnp.zeros((len(ball.faces), 3)))
+    medium = Medium(
+        jnp.asarray([[-0.5] * 3, [0.5] * 3], jnp.float32), jnp.full(3, 12.0), jnp.full(3, 0.05), jnp.float32(0),
+        ior=jnp.float32(1.5), boundary=boundary,
+    )  # fmt: skip
+    scene = Scene(medium=medium, directional_lights=DirectionalLights(jnp.asarray([[0.0, 0, 1.0]]), jnp.ones((1, 3))))
+    plan = lattice_boltzmann.plan(scene, None, resolution=40, rays_per_voxel=2.0)
+    light = lattice_boltzmann.illuminate(scene, plan)
+    absorbed = float(jnp.sum(light.materials.absorption[0] * (light.from_light + light.scattered)[0]))
+    rng = np.random.default_rng(0)
+    n, radius = 6000, 0.55
+    direction = rng.normal(size=(n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    other = rng.normal(size=(n, 3))
+    across = other - np.sum(other * direction, 1, keepdims=True) * direction
+    across *= radius * np.sqrt(rng.random(n))[:, None] / np.linalg.norm(across, axis=1, keepdims=True)
+    rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (across - 2 * direction, direction, np.full(n, np.inf))))
+    found = lattice_boltzmann.radiance(scene, rays, plan, light)
+    leaving = sum(v[:, 0] for k, v in found.items() if k.startswith("volume")).mean() * 4 * np.pi * np.pi * radius**2
+    sent, straight = (float(light.diagnostics[k][0]) for k in ("sent", "escaped_unscattered"))
+    assert absorbed + leaving + straight == pytest.approx(sent, rel=0.1)
+
+
+def test_illumination_is_linear_in_its_stages():
+    """Marched light alone carries the first layer: without scattering orders beyond it nothing else is lit."""
+    scene = _scene(sigma_s=(1e-4,) * 3, sigma_a=(1.0,) * 3)
+    plan = lattice_boltzmann.plan(scene, None, **SMALL)
+    light = illumination.illuminate(scene, plan)
+    assert float(jnp.max(light.scattered)) < 1e-3 * float(jnp.max(light.from_light))
