@@ -41,12 +41,13 @@ def from_lights(
 ) -> LightRays:
     """Rays from every light into the box [low, high], about `rays_per_voxel` per voxel face across the beam; shadows apply."""
     center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)) * 1.0001
+    back = 2.0 * float(emission.bounding_sphere(scene)[1])  # before any surface, for lights at infinity
     across = max(int(rays_per_voxel * math.pi * (radius / voxel) ** 2), 64)
     parts = []
     if scene.directional_lights is not None:
         suns = scene.directional_lights
         for d, e in zip(np.asarray(suns.direction, float), np.asarray(suns.irradiance, float), strict=True):
-            parts.append(_parallel(d, e, low, high, voxel / math.sqrt(rays_per_voxel), seed))
+            parts.append(_parallel(d, e, low, high, voxel / math.sqrt(rays_per_voxel), back, seed))
     if scene.point_lights is not None:
         bulbs = scene.point_lights
         for p, i in zip(np.asarray(bulbs.position, float), np.asarray(bulbs.intensity, float), strict=True):
@@ -58,7 +59,7 @@ def from_lights(
     if scene.area_lights is not None:
         parts.append(_area(scene, center, radius, 4 * across, seed))
     if scene.environment is not None:
-        parts.append(_environment(scene, center, radius, 4 * across, seed))
+        parts.append(_environment(scene, center, radius, 4 * across, back, seed))
     if not parts:
         empty = np.zeros((0, 3))
         return LightRays(empty, empty, empty, np.zeros(0))
@@ -89,7 +90,7 @@ def _basis(direction):
     return np.asarray(s, float), np.asarray(t, float)
 
 
-def _parallel(direction, irradiance, low, high, spacing, seed):
+def _parallel(direction, irradiance, low, high, spacing, back, seed):
     s, t = _basis(direction)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     u, v, w = corners @ s, corners @ t, corners @ direction
@@ -98,7 +99,7 @@ def _parallel(direction, irradiance, low, high, spacing, seed):
     i, j = (a.ravel() for a in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
     jitter = kronecker(nu * nv, 2, seed)
     across = (u.min() + (i + jitter[:, 0]) * du)[:, None] * s + (v.min() + (j + jitter[:, 1]) * dv)[:, None] * t
-    origin = across + (w.min() - spacing) * direction
+    origin = across + (w.min() - back) * direction
     return origin, np.broadcast_to(direction, origin.shape), np.broadcast_to(irradiance * du * dv, origin.shape)
 
 
@@ -168,7 +169,7 @@ def _area(scene, center, radius, count, seed):
     return point + 1e-4 * radius * normal, direction, power
 
 
-def _environment(scene, center, radius, count, seed):
+def _environment(scene, center, radius, count, back, seed):
     u = kronecker(count, 4, seed)
     u1, u2 = (jnp.asarray(u[:, k], jnp.float32) for k in (0, 1))
     towards, pdf = lights.sample_environment(scene.environment, u1, u2)
@@ -176,7 +177,7 @@ def _environment(scene, center, radius, count, seed):
     direction = -np.asarray(towards, float)
     s, t = (np.asarray(b, float) for b in sampling.orthonormal_basis(jnp.asarray(direction, jnp.float32)))
     r, phi = radius * np.sqrt(u[:, 2]), 2 * math.pi * u[:, 3]
-    origin = center - radius * direction + (r * np.cos(phi))[:, None] * s + (r * np.sin(phi))[:, None] * t
+    origin = center - (radius + back) * direction + (r * np.cos(phi))[:, None] * s + (r * np.sin(phi))[:, None] * t
     return origin, direction, radiance * (math.pi * radius**2 / (np.asarray(pdf, float) * count))[:, None]
 
 
