@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -21,12 +22,21 @@ import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 import jaxvol
+from jaxvol.jobs import Parts, Stop
 from jaxvol.layers import NAMES, SURFACE, VOLUME, Claim, total
 from jaxvol.scene import SceneFile
 from jaxvol.scene_config import nearest
 from jaxvol.types import Estimate, Scene
 
-OFFERED = ("seed", "on_progress", "on_stage")  # what the caller of `render_scene` provides, never a scene file
+OFFERED = (
+    "seed",
+    "on_progress",
+    "on_stage",
+    "parts",
+    "stop",
+    "seconds",
+    "until_error",
+)  # what the caller of `render_scene` provides, never a scene file
 SAMPLES = ("samples", "num_samples")  # both names that methods give to samples per pixel
 NEVER = 2**30  # a number of scatterings that no path reaches
 COMPILING = "/jax/core/compile/"
@@ -92,10 +102,40 @@ def _typed(key: str, value: Any, annotation: Any) -> Any:
         raise ValueError(f"{key} = {value!r} must be {expected}") from error
 
 
-Progress = Callable[[float], None]
+Progress = Callable[..., None]  # (share of the work that is done, note)
 
 
-def render_scene(file: SceneFile, *, method: str | None = None, on_progress: Progress | None = None) -> Rendering:
+@dataclass(frozen=True)
+class Job:
+    """How a render that may take long is kept and ended; for methods whose `render` takes `parts` and `stop`."""
+
+    folder: Path  # of the saved accumulators
+    stop: Stop
+    goal: dict[str, float]  # `seconds` or `until_error`, where given instead of a number of samples
+
+
+def _job_arguments(job: Job | None, name: str, module: ModuleType, file: SceneFile, plan: object) -> dict[str, Any]:
+    """Keyword arguments of a job; a folder that holds another scene's samples is started anew."""
+    taken = inspect.signature(module.render).parameters
+    for key in {} if job is None else job.goal:
+        if key not in taken:
+            raise ValueError(
+                f"--{'time' if key == 'seconds' else 'until-error'}: {name} does not refine; only path_tracing does"
+            )
+    if job is None or "parts" not in taken:
+        return {}
+    digest = module.scene_digest(file.scene, file.camera)
+    config = {"scene": digest, "plan": repr(plan), "seed": file.render.seed, "versions": versions()}
+    try:
+        parts = Parts(job.folder, config=config)
+    except ValueError:
+        parts = Parts(job.folder, config=config, restart=True)
+    return {"parts": parts, "stop": job.stop, **job.goal}
+
+
+def render_scene(
+    file: SceneFile, *, method: str | None = None, on_progress: Progress | None = None, job: Job | None = None
+) -> Rendering:
     """Plan and render the scene with one method, timed. Raises ValueError for what the method refuses."""
     name = file.render.method if method is None else method
     if file.camera is None:
@@ -120,6 +160,7 @@ def render_scene(file: SceneFile, *, method: str | None = None, on_progress: Pro
         offered = {"seed": file.render.seed, "on_progress": on_progress, "on_stage": on_stage}
         taken = inspect.signature(module.render).parameters
         offered = {key: value for key, value in offered.items() if key in taken and value is not None}
+        offered |= _job_arguments(job, name, module, file, plan)
         estimate = module.render(file.scene, file.camera, plan, **render_arguments, **offered)
         estimate = jax.block_until_ready(estimate)
         done = time.perf_counter()

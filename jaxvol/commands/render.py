@@ -22,6 +22,10 @@ def render(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as in medium.anisotropy=0.3.")
     ] = None,
     samples: Annotated[int | None, typer.Option(help="Samples per pixel, for methods that sample.")] = None,
+    until_error: Annotated[
+        float | None, typer.Option(help="Go on until the mean standard error of 8 x 8 blocks over the mean is this small.")
+    ] = None,
+    time_: Annotated[float | None, typer.Option("--time", help="Go on for about this many seconds.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the random numbers.")] = None,
     explain: Annotated[bool, typer.Option("--explain", help="Print what the scene lacks and so what is skipped.")] = False,
 ) -> None:
@@ -39,16 +43,21 @@ def render(
             print(line)
 
     name = file.render.method
-    with jobs.progress(f"{file.name}, {name}", total=100) as advance:
+    goal = {"seconds": time_, "until_error": until_error}
+    with jobs.stoppable() as stop, jobs.progress(f"{file.name}, {name}", total=100) as advance:
         done = 0.0
 
-        def on_progress(share: float) -> None:
+        def on_progress(share: float, note: str = "") -> None:
             nonlocal done
-            advance(100 * max(min(share, 1.0) - done, 0.0))
+            advance(100 * max(min(share, 1.0) - done, 0.0), note=note)
             done = max(done, min(share, 1.0))
 
-        result = rendering.render_scene(file, on_progress=on_progress)
-        advance(100 * (1.0 - done))
+        job = rendering.Job(out / f"{file.name}.parts", stop, {key: value for key, value in goal.items() if value is not None})
+        result = rendering.render_scene(file, on_progress=on_progress, job=job)
+        stopped = bool(result.estimate.diagnostics.get("stopped", False))
+        if not stopped:
+            advance(100 * (1.0 - done))
+    _report_job(result, stopped)
     if explain:
         _explain(result)
     try:
@@ -58,6 +67,18 @@ def render(
     if result.nonfinite_pixels:
         _say(f"error: {result.nonfinite_pixels} pixels are not finite (magenta in the PNG)")
         raise typer.Exit(1)
+
+
+def _report_job(result: rendering.Rendering, stopped: bool) -> None:
+    """How good the picture is, for methods that know; and where a stopped or resumed one stands."""
+    found = result.estimate.diagnostics
+    if found.get("resumed_samples", 0):
+        _say(f"resumed after {int(found['resumed_samples'])} samples a pixel of an earlier run")
+    if "error" in found:
+        spent = f"{int(result.estimate.num_samples)} samples a pixel"
+        _say(f"error {float(found['error']):.2%} (standard error of 8 x 8 blocks over the mean) with {spent}")
+    if stopped:
+        _say("stopped early; the same command goes on from here")
 
 
 def _say(line: str) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
@@ -19,11 +20,13 @@ from jaxvol.methods.path_tracing.lanes import (
     SURFACE_LIGHT,
     VOLUME_LIGHT,
     Settings,
+    num_columns,
     possible_groups,
 )
-from jaxvol.types import Camera, Estimate, Layers, Medium, Rays, Scene
+from jaxvol.types import Estimate, Layers, Medium, Rays, Scene
 
 Progress = Callable[[float], None]
+_RANGE = 1 << 18  # pixels traced together
 
 
 @dataclass(frozen=True)
@@ -139,40 +142,57 @@ def _skipped(scene, medium, drop_medium, settings, lit):
     return tuple(reasons)
 
 
-def _run(scene, sensor, plan, *, seed, num_samples, first_sample=0, on_progress=None):
-    """Film of all pixels, in ranges of pixels that keep memory bounded."""
+def add_samples(
+    film: np.ndarray,
+    scene: Scene,
+    sensor: sensors.Sensor,
+    plan: Plan,
+    *,
+    seed: int,
+    first_sample: int,
+    num_samples: int,
+    num_lanes: int,
+    on_progress: Progress | None = None,
+) -> None:
+    """Trace `num_samples` more samples of every pixel into `film` [2, P, columns], in ranges that bound the memory.
+
+    Samples are numbered, so the film does not depend on how they are split, beyond rounding. `on_progress(share)` may
+    raise to give up; the film is then of no use.
+    """
     if plan.drop_medium:
         scene = Scene(**{**{f: getattr(scene, f) for f in Scene.__dataclass_fields__}, "medium": None})
     total = sensors.num_pixels(sensor)
-    films = []
-    chunk = 1 << 18
-    for first in range(0, total, chunk):
-        count = min(chunk, total - first)
+    for first in range(0, total, _RANGE):
+        count = min(_RANGE, total - first)
         report = None
         if on_progress is not None:
             report = lambda share, first=first, count=count: on_progress((first + share * count) / total)  # noqa: E731
-        films.append(
-            driver.run(
-                scene,
-                sensor,
-                plan.settings,
-                groups=plan.groups,
-                num_shadows=plan.num_shadows,
-                num_lanes=_lanes_for(count * num_samples, plan.num_lanes),
-                max_spans=plan.max_spans,
-                kind=plan.caster,
-                seed=seed,
-                first_pixel=first,
-                num_pixels=count,
-                first_sample=first_sample,
-                num_samples=num_samples,
-                on_step=report,
-            ).reshape(2, count, -1)
+        part = driver.run(
+            scene,
+            sensor,
+            plan.settings,
+            groups=plan.groups,
+            num_shadows=plan.num_shadows,
+            num_lanes=num_lanes,
+            max_spans=plan.max_spans,
+            kind=plan.caster,
+            seed=seed,
+            first_pixel=first,
+            num_pixels=count,
+            first_sample=first_sample,
+            num_samples=num_samples,
+            on_step=report,
         )
-    return np.concatenate(films, axis=1)
+        film[:, first : first + count] += part.reshape(2, count, -1)
 
 
-def _lanes_for(items, limit):
+def empty_film(sensor: sensors.Sensor, plan: Plan) -> np.ndarray:
+    """A film of zeros [2, P, columns]; double precision where that costs little, for sums of very many samples."""
+    total = sensors.num_pixels(sensor)
+    return np.zeros((2, total, num_columns(plan.groups)), np.float64 if total <= _RANGE else np.float32)
+
+
+def lanes_for(items: int, limit: int) -> int:
     """Lanes in powers of four, so that renders of all sizes share a few compilations."""
     lanes = 256
     while lanes < limit and lanes * 8 < items:
@@ -186,63 +206,47 @@ def film_to_layers(film: np.ndarray, groups: tuple[int, ...], num_samples: int) 
     The variance is that of independent samples: (E[x^2] - E[x]^2) / (n - 1); 0 for a single sample.
     """
     width = len(groups) + 1
-    values = film.astype(np.float64).reshape(2, film.shape[1], 2, width, 3)
-    both = values.sum(axis=0)
     column = {group: i for i, group in enumerate(groups)}
-    sources = {"total": both[:, :, -1]}
+    values = film.reshape(2, film.shape[1], 2, width, 3)
+    sources = {"total": (slice(None), width - 1)}
     for name, group in (("emission", EMISSION), ("surface_from_light", SURFACE_LIGHT), ("volume_from_light", VOLUME_LIGHT)):
         if group in column:
-            sources[name] = both[:, :, column[group]]
+            sources[name] = (slice(None), column[group])
     for row, kind, present in ((0, "surface", SURFACE_LIGHT in column), (1, "volume", VOLUME_LIGHT in column)):
         for source, group in (("surface", FROM_SURFACE), ("volume", FROM_VOLUME), ("multiple", FROM_MULTIPLE)):
             if present and group in column:
-                sources[f"{kind}_from_{source}"] = values[row][:, :, column[group]]
+                sources[f"{kind}_from_{source}"] = (slice(row, row + 1), column[group])
     mean, variance = {}, {}
-    for name, columns in sources.items():
-        average = columns[:, 0] / num_samples
-        square = columns[:, 1] / num_samples
+    for name, (rows, index) in sources.items():
+        average = values[rows, :, 0, index].sum(axis=0, dtype=np.float64) / num_samples
+        square = values[rows, :, 1, index].sum(axis=0, dtype=np.float64) / num_samples
         mean[name] = average.astype(np.float32)
         variance[name] = (np.maximum(square - average**2, 0.0) / max(num_samples - 1, 1)).astype(np.float32)
     return mean, variance
 
 
-def _estimate(film, plan, num_samples, shape) -> Estimate:
+def to_estimate(film: np.ndarray, plan: Plan, num_samples: int, shape: tuple[int, ...]) -> Estimate:
+    """All nine layers with their variances from a film of `num_samples` samples a pixel."""
     mean, variance = film_to_layers(film, plan.groups, num_samples)
     zeros = np.zeros((film.shape[1], 3), np.float32)
     full = lambda found: Layers(  # noqa: E731
         **{name: jnp.asarray(found.get(name, zeros).reshape(*shape, 3)) for name in layer_classes.NAMES}
     )
+    spread = full(variance)
+    whole = {"+".join(layer_classes.NAMES): jnp.asarray(variance["total"].reshape(*shape, 3))}
     return Estimate(
         mean=full(mean),
-        variance=full(variance),
+        variance=eqx.tree_at(lambda x: x.sums, spread, whole),  # layers of one path are not independent
         num_samples=jnp.float32(num_samples),
-        diagnostics={"variance_of_total": jnp.asarray(variance["total"].reshape(*shape, 3))},
     )
-
-
-def render(
-    scene: Scene,
-    camera: Camera,
-    plan: Plan,
-    *,
-    seed: int = 0,
-    samples: int = 64,
-    on_progress: Progress | None = None,
-) -> Estimate:
-    """The picture in all nine layers [H, W, 3] with the variance of each mean, from `samples` paths a pixel.
-
-    Unbiased. `on_progress(share)` is called as it goes. Raises ValueError for samples < 1.
-    """
-    if samples < 1:
-        raise ValueError(f"samples: {samples} is not allowed, must be >= 1")
-    film = _run(scene, camera, plan, seed=seed, num_samples=samples, on_progress=on_progress)
-    return _estimate(film, plan, samples, (camera.height, camera.width))
 
 
 def _sense(scene, sensor, shape, *, seed, samples, **options):
     decided = plan(scene, sensor, **options)
-    film = _run(scene, sensor, decided, seed=seed, num_samples=samples)
-    return _estimate(film, decided, samples, shape)
+    film = empty_film(sensor, decided)
+    lanes = lanes_for(sensors.num_pixels(sensor) * samples, decided.num_lanes)
+    add_samples(film, scene, sensor, decided, seed=seed, first_sample=0, num_samples=samples, num_lanes=lanes)
+    return to_estimate(film, decided, samples, shape)
 
 
 def radiance(scene: Scene, rays: Rays, *, seed: int = 0, samples: int = 64, **options) -> Estimate:

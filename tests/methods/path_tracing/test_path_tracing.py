@@ -42,7 +42,7 @@ def point(position, intensity=1.0):
 
 def total_and_error(estimate):
     """Image and its standard error, first channel."""
-    variance = np.asarray(estimate.diagnostics["variance_of_total"])
+    variance = np.asarray(estimate.variance.sums["+".join(layers.NAMES)])
     return np.asarray(layers.total(estimate.mean)), np.sqrt(variance)
 
 
