@@ -110,8 +110,9 @@ def test_single_scattering_of_a_point_light_per_channel_and_on_a_constant_grid()
     expected = np.sum((phase / distance**2)[:, None] * np.exp(-depth), axis=0) * (t[1] - t[0]) * sigma_s
     for density in (None, np.ones((6, 5, 4), np.float32)):
         scene = Scene(medium=fog(sigma_s, sigma_a, g, half=1.0, density=density), point_lights=lamp_at(light))
-        found = direct.radiance(scene, ray(origin, [1, 0, 0]), direct.plan(scene, None)).volume_from_light
-        np.testing.assert_allclose(found[0], expected, rtol=4e-3)
+        plan = direct.plan(scene, None, num_cells=64, num_steps=32)
+        found = direct.radiance(scene, ray(origin, [1, 0, 0]), plan).volume_from_light
+        np.testing.assert_allclose(found[0], expected, rtol=1.5e-3)
         assert found[0, 2] == 0.0
 
 
@@ -201,6 +202,7 @@ def test_many_emissive_faces_are_sampled_by_area_to_the_same_result():
         scene = Scene(mesh=mesh, medium=fog((0.3,) * 3), area_lights=lights.area_lights(mesh))
         plan = direct.plan(scene, None, samples_per_pixel=64, num_area_points=8)
         found.append(direct.radiance(scene, rays, plan))
+    assert np.asarray(found[0].surface_from_light).max() > 0.01
     np.testing.assert_allclose(found[1].surface_from_light, found[0].surface_from_light, rtol=0.01)
     np.testing.assert_allclose(found[1].volume_from_light, found[0].volume_from_light, rtol=0.02)
 
@@ -234,6 +236,33 @@ def test_sky_on_a_glossy_floor_is_its_albedo():
     ).surface_from_light
     lobe = 42 / 41 * 41 / 42  # int (n+2)/(2 pi) cos^n cos dw = 1 at normal incidence
     np.testing.assert_allclose(found[0], 2 * (np.array([0.3, 0.2, 0.1]) + 0.5 * lobe), rtol=0.01)
+
+
+def test_columns_towards_a_directional_light():
+    """The sheared sums against marching, for points before, in, beside and behind the box; second order in the voxel."""
+    from jaxvol import extinction
+    from jaxvol.direct import light_columns
+
+    rng = np.random.default_rng(0)
+    points = f32(rng.uniform([-1.5, -0.5, 1.5], [1.5, 2, 4.5], (2000, 3)))
+    for way in ([0.0, -1.0, 0.0], [-0.6, -0.5, -0.62]):
+        errors, way = [], np.asarray(way) / np.linalg.norm(way)
+        for shape in ((12, 10, 14), (24, 20, 28)):
+            x, y, z = np.meshgrid(*[(np.arange(n) + 0.5) / n for n in shape], indexing="ij")
+            grid = 1 + np.sin(5 * x) * np.cos(4 * y) * np.sin(3 * z + 1)
+            medium = dataclasses.replace(fog(density=grid), bounds=f32([[-1, 0, 2], [1, 1.5, 4]]))
+            marching = extinction.marching_medium(medium)
+            found = light_columns.optical_thickness(light_columns.light_columns(marching, f32(way)), medium, points)
+            exact = extinction.optical_thickness(
+                medium,
+                points,
+                jnp.broadcast_to(f32(-way), points.shape),
+                jnp.full(2000, jnp.inf),
+                casters=(None,),
+                num_steps=400,
+            )
+            errors.append(float(jnp.mean(jnp.abs(found - exact)) / jnp.mean(exact)))
+        assert errors[1] < 0.008 and errors[1] < errors[0] / 3
 
 
 def test_shadow_of_a_screen():
@@ -300,7 +329,7 @@ def test_render_matches_the_path_tracer():
     scene, camera = lit_scene(), small_camera()
     mine = direct.render(scene, camera, direct.plan(scene, camera))
     plan = path_tracing.plan(scene, camera, max_scatterings=1, num_lanes=4096)
-    theirs = path_tracing.render(scene, camera, plan, seed=3, samples=512)
+    theirs = path_tracing.render(scene, camera, plan, seed=3, samples=1024)
 
     def blocks(x):
         return np.asarray(x, np.float64).reshape(4, 3, 4, 3, 3).mean(axis=(1, 3))
@@ -310,7 +339,7 @@ def test_render_matches_the_path_tracer():
         error = np.sqrt(v / 9) + 0.005 * b.max()
         assert np.mean(np.abs(a - b) < 3 * error) > 0.98, name
         noise = np.sqrt((v / 9 / 16).sum()) / b.sum() * 4
-        assert noise < 0.02
+        assert noise < 0.04
         assert abs(a.sum() / b.sum() - 1) < 4 * noise + 0.01, name
     assert mine.auxiliary.depth.shape == (12, 12)
 

@@ -84,8 +84,17 @@ def connect(scene, faces, incoming, hits, pixel, sample, seed, *, kind: str, num
             weight = weight / (1.0 + num_bsdf / num_light * other / jnp.where(light.pdf > 0, light.pdf, 1.0))
         weight = jnp.where(light.pdf > 0, weight, 0.0)
         value = _reflected(surface, incoming, hits, normal, light.direction) * light.radiance * weight[:, None]
-        found.append((offset(light.direction), light.direction, light.distance, value))
+        found.append((*_aim(offset(light.direction), light), value))
     return Connections(*(jnp.stack(part) for part in zip(*found, strict=True)))
+
+
+def _aim(origin, light):
+    """Origin, direction and distance from the offset origin: on a large mesh the offset exceeds the shadow ray's margin."""
+    delta = light.position - origin
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
+    finite = jnp.isfinite(light.distance)
+    direction = jnp.where(finite[:, None], delta / distance[:, None], light.direction)
+    return origin, direction, jnp.where(finite, distance, jnp.inf)
 
 
 def _bsdf_directions(surface, incoming, hits, pixel, sample, seed, k, num_bsdf):
