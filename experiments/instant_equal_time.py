@@ -9,9 +9,11 @@ Usage: taskset -c 0 python experiments/instant_equal_time.py cube|cube_g|plume [
 import argparse
 import os
 import time
+from functools import partial
 
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from instant_common import SCENES, figure, out_folder, pictures, square_camera, write_csv
@@ -27,7 +29,7 @@ OURS = {
     "full resolution": {},
     "low resolution": {"upsample": 4, "jitter": False},
 }
-PATHS = (64, 256, 1024, 4096)
+PATHS = (256, 1024, 4096)
 
 
 def mitsuba_scene(scene, size):
@@ -69,9 +71,10 @@ def mitsuba_scene(scene, size):
     )
 
 
-def single_scattering(context, camera, index):
+@partial(jax.jit, static_argnames="plan")
+def single_scattering(scene, mip, camera, index, seed, *, plan):
     """Light scattered once, one equi-angular point (homogeneous) or one transmittance-sampled point per eye ray."""
-    scene = context.scene
+    context = rendering.Context(scene, None, None, mip, plan, seed)
     origin, direction, t, _, _ = rendering.eye_rays(context, camera, index)
     segments = stages.segments_of(context, origin, direction, t)
     u = sampling.uniforms(context.seed, sampling.stream("experiment.single"), index, 0)
@@ -99,10 +102,10 @@ def ours(scene, camera, plan, seed):
     start = time.process_time()
     images, counts = rendering.render_set(scene, camera, plan, seed=seed, sizes=SIZES.setdefault(plan.num_paths, {}))
     total = sum(images.values())
-    context = rendering.Context(scene, None, None, mip_of(scene, plan), plan, seed)
+    index = jnp.arange(len(total), dtype=jnp.uint32)
     for k in range(4):
-        context = context._replace(seed=seed * 4 + k)
-        total = total + np.asarray(single_scattering(context, camera, jnp.arange(len(total), dtype=jnp.uint32))) / 4
+        single = single_scattering(scene, mip_of(scene, plan), camera, index, jnp.uint32(seed * 4 + k), plan=plan)
+        total = total + np.asarray(single) / 4
     return total, time.process_time() - start, counts
 
 
@@ -128,7 +131,8 @@ def main():
     parser.add_argument("--variant", default="llvm_ad_rgb")
     parser.add_argument("--reference", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--levels", type=int, default=2)
+    parser.add_argument("--levels", type=int, default=3)
+    parser.add_argument("--mean-free-paths", type=float, default=0.5)
     arguments = parser.parse_args()
     import drjit
     import mitsuba as mi
@@ -153,7 +157,9 @@ def main():
         print(*rows[-1], flush=True)
     for label, options in OURS.items():
         for number in PATHS:
-            plan = ims.plan(scene, camera, num_paths=number, num_levels=arguments.levels, tile=4096, **options)
+            plan = ims.plan(
+                scene, camera, num_paths=number, num_levels=arguments.levels, mean_free_paths=arguments.mean_free_paths, tile=4096, **options
+            )
             ours(scene, camera, plan, 1)
             results = [ours(scene, camera, plan, 10 + k) for k in range(arguments.repeats)]
             errors = [relmse(image, *halves) for image, _, _ in results]

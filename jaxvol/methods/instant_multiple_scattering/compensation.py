@@ -238,8 +238,3 @@ def coarse_density(density: Float[Array, "X Y Z"], *, block: int) -> np.ndarray:
 def clamp_distance(sigma: Float[Array, "*n"], *, mean_free_paths: float, most: float) -> Float[Array, "*n"]:
     """d = mean_free_paths / sigma, at most `most` (a length)."""
     return jnp.minimum(mean_free_paths / jnp.maximum(sigma, 1e-12), most)
-
-
-def rises(sigma: Float[Array, "n"], gradient: Float[Array, "n"], d: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Change of extinction over the clamp distance relative to its local mean: above about 1 the "local" mode is off."""
-    return gradient * d / jnp.maximum(sigma, 1e-12)

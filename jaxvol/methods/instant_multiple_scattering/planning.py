@@ -23,6 +23,7 @@ class Plan:
     most_clamp: float  # upper limit of the clamp distance, a length
     num_levels: int
     num_chains: int
+    num_direct: int
     light_stride: int
     end: str
     distance: str
@@ -79,6 +80,7 @@ def plan(
     mean_free_paths: float | None = 0.5,
     num_levels: int = 3,
     num_chains: int = 1,
+    num_direct: int = 4,
     light_stride: int = 4,
     end: str = "clamped",
     distance: str = "weight",
@@ -102,7 +104,8 @@ def plan(
 
     num_paths: light paths of a set; num_sets: independent sets that are averaged (two or more give a variance).
     mean_free_paths: clamp distance d = mean_free_paths / local sigma_t, at most a tenth of the scene (None: unclamped).
-    num_levels: compensation steps; 0 = clamped only (biased). num_chains: new vertices per receiver on the first step.
+    num_levels: compensation steps; 0 = clamped only (biased). num_chains: chains of new vertices per receiver
+    that gather from virtual lights; num_direct: chains that only see the primary lights, which are cheap.
     light_stride: new vertices gather from one of `light_stride` lights, another share each time.
     end: what happens beyond the last step: "clamped" (loses about (1/3)^(num_levels + 1) of the energy), "unclamped"
     (unbiased, infinite variance), "reduced" (bound times 16).
@@ -128,8 +131,8 @@ def plan(
     for key, value in given.items():
         if value not in CHOICES[key]:
             raise ValueError(f"{key}: {value!r} is not allowed, must be one of {', '.join(CHOICES[key])}")
-    least = {"num_paths": 1, "num_sets": 1, "max_depth": 1, "num_levels": 0, "num_chains": 1, "num_evaluations": 1}
-    least.update(group_size=1, mip_block=1, upsample=1, tile=64)
+    least = {"num_paths": 1, "num_sets": 1, "max_depth": 1, "num_levels": 0, "num_chains": 1, "num_direct": 1}
+    least.update(num_evaluations=1, group_size=1, mip_block=1, upsample=1, tile=64)
     for key, low in least.items():
         if locals()[key] < low:
             raise ValueError(f"{key}: {locals()[key]} is not allowed, must be >= {low}")
@@ -153,6 +156,7 @@ def plan(
         most_clamp=0.1 * side if tracked or scene.mesh is not None else side,
         num_levels=num_levels if mean_free_paths is not None else 0,
         num_chains=num_chains,
+        num_direct=num_direct,
         light_stride=light_stride,
         end=end,
         distance=distance,

@@ -75,24 +75,27 @@ def _scaled(sums, scale):
 
 
 def _chains(context, points_for, index):
-    """Mean residual over the chains; points_for(chain) gives points and throughput."""
+    """Mean residual over the chains; points_for(chain, number) gives points and throughput of one of `number`."""
+    plan = context.plan
     total = stages.zero_sums(index.shape[0])
-    if context.plan.num_levels == 0:
+    if plan.num_levels == 0:
         return total
-    number = context.plan.num_chains
-    for chain in range(number):
-        points, throughput = points_for(chain)
-        found = stages.compensate(context, points, throughput, index, chain=chain)
-        total = {name: total[name] + found[name] / number for name in total}
+    kinds = [(plan.num_chains, False, 0)]
+    if plan.direct_at_vertex:
+        kinds.append((plan.num_direct, True, plan.num_chains))
+    for number, lit, first in kinds:
+        for chain in range(number):
+            points, throughput = points_for(chain, number)
+            found = stages.compensate(context, points, throughput, index, chain=first + chain, lit=lit)
+            total = {name: total[name] + found[name] / number for name in total}
     return total
 
 
 def _volume(context, origin, direction, t, index):
     segments = stages.segments_of(context, origin, direction, t)
     gathered = stages.gather_segments(context, segments, index)
-    number = context.plan.num_chains
 
-    def eye(chain):
+    def eye(chain, number):
         u = sampling.uniforms(context.seed, _PIXEL, index, 2)[0]
         return stages.eye_vertices(context, segments, (u + chain) / number)
 
@@ -117,7 +120,7 @@ def _surface(context, origin, direction, t, face, index):
     points = Points(hit.position, -direction, nothing, clamp, hit.valid, hit.normal, surface)
     u = sampling.uniforms(context.seed, _PIXEL, index, 3)[0]
     gathered = _scaled(stages.gather_points(context, points, u, stride=1, offset=0), tau)
-    residual = _chains(context, lambda chain: (points, tau), index + jnp.uint32(0x40000000))
+    residual = _chains(context, lambda chain, number: (points, tau), index + jnp.uint32(0x40000000))
     return {name: gathered[name] + residual[name] for name in gathered}
 
 
@@ -233,29 +236,28 @@ def render(
     Diagnostics: "num_truncated" light paths that were cut at max_depth, "num_lights" virtual lights of all sets; with
     upsampling "num_evaluated" and "num_refined" pixels.
     """
-    total = {name: 0.0 for name in NAMES}
-    squares = {name: 0.0 for name in NAMES}
     counts: dict[str, int] = {}
     sizes: dict[str, int] | None = {} if plan.num_sets > 1 else None
+    mean: dict[str, np.ndarray] = {}
+    squares = {name: np.float32(0.0) for name in NAMES}  # summed squared deviations from the mean (Welford 1962)
     for k in range(plan.num_sets):
         images, found = render_set(scene, camera, plan, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes)
-        for name in NAMES:
-            total[name] = total[name] + images[name].astype(np.float64)
-            squares[name] = squares[name] + np.square(images[name].astype(np.float64))
         counts = {name: counts.get(name, 0) + value for name, value in found.items()}
+        for name in NAMES:
+            before = mean.get(name, np.float32(0.0))
+            mean[name] = images[name] if k == 0 else before + (images[name] - before) / (k + 1)
+            if k > 0:
+                squares[name] = squares[name] + (images[name] - before) * (images[name] - mean[name])
         if on_progress is not None:
             on_progress((k + 1) / plan.num_sets)
     number = plan.num_sets
     shape = (camera.height, camera.width, 3)
-    mean = {name: jnp.asarray((total[name] / number).reshape(shape), jnp.float32) for name in NAMES}
     variance = None
     if number > 1:
-        spread = {name: np.maximum(squares[name] / number - np.square(total[name] / number), 0.0) for name in NAMES}
-        variance = layers.from_items(
-            {name: jnp.asarray((spread[name] / (number - 1)).reshape(shape), jnp.float32) for name in NAMES}
-        )
+        scale = 1.0 / (number * (number - 1))
+        variance = layers.from_items({name: jnp.asarray((squares[name] * scale).reshape(shape)) for name in NAMES})
     return Estimate(
-        mean=layers.from_items(mean),
+        mean=layers.from_items({name: jnp.asarray(image.reshape(shape)) for name, image in mean.items()}),
         variance=variance,
         num_samples=jnp.float32(number) if number > 1 else None,
         diagnostics={name: jnp.asarray(value) for name, value in counts.items()},

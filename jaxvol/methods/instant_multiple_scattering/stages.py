@@ -204,12 +204,21 @@ def _eye_vertices(scene, mip, segments, u, *, plan):
 
 
 def compensate(
-    context: Context, points: Points, throughput: Float[Array, "n 3"], index: UInt[Array, "n"], *, chain: int
+    context: Context,
+    points: Points,
+    throughput: Float[Array, "n 3"],
+    index: UInt[Array, "n"],
+    *,
+    chain: int,
+    lit: bool,
 ) -> Sums:
-    """The residual of clamping at points (section 4.3), through `num_levels` new vertices one after the other."""
+    """The residual of clamping at points (section 4.3), through `num_levels` new vertices one after the other.
+
+    `lit`: only the primary lights' share of it, else only the virtual lights': the first is a few rays, the second a sum
+    over many lights, and most of the noise is in the first, so that they are sampled apart.
+    """
     plan, scene = context.plan, context.scene
     sums = zero_sums(index.shape[0])
-    lit = plan.direct_at_vertex and primary.num_lights(scene) > 0
     for level in range(plan.num_levels):
         u = _chain_uniforms(context.seed, index, jnp.int32(chain * plan.num_levels + level))
         proposal = _propose(scene, points, u)
@@ -217,17 +226,21 @@ def compensate(
         points, throughput, sample, origin = _advance(
             scene, context.mip, points, proposal, throughput, s, face, u, plan=plan, lit=lit
         )
-        found = _gather_at_end(context, points, u[5], chain, level)
-        if lit:
-            visible = None
-            if scene.mesh is not None:
-                short = sample.distance * (1.0 - 1e-4)
-                visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
-            direct = _direct(scene, points, sample, visible, plan=plan)
-        else:
-            direct = jnp.zeros_like(throughput)
-        sums = _book(sums, found, points, throughput, direct, jnp.bool_(level == 0))
+        if not lit:
+            found = _gather_at_end(context, points, u[5], chain, level)
+            sums = {**sums, "multiple": _add_product(sums["multiple"], throughput, *found.values())}
+            continue
+        visible = None
+        if scene.mesh is not None:
+            short = sample.distance * (1.0 - 1e-4)
+            visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
+        sums = _book_direct(scene, sums, points, throughput, sample, visible, jnp.bool_(level == 0), plan=plan)
     return sums
+
+
+@jax.jit
+def _add_product(total, throughput, *parts):
+    return total + throughput * sum(parts)
 
 
 def _gather_at_end(context, points, u, chain, level):
@@ -273,21 +286,16 @@ def _advance(scene, mip, points, proposal, throughput, s, face, u, *, plan, lit)
 
 
 @partial(jax.jit, static_argnames="plan")
-def _direct(scene, points, sample, visible, *, plan):
+def _book_direct(scene, sums, points, throughput, sample, visible, first, *, plan):
+    """Add the primary light at new vertices: by what the first vertex is, later ones to "multiple"."""
     steps = max(plan.pair_steps, plan.eye_steps)
-    return compensation.direct_light(scene, points, sample, visible, isotropic=plan.isotropic, num_steps=steps)
-
-
-@jax.jit
-def _book(sums, found, points, throughput, direct, first):
-    """Add what new vertices send on: virtual lights to "multiple", primary light by what the first vertex is."""
-    value = throughput * direct
-    total = found["surface"] + found["volume"] + found["multiple"]
+    value = compensation.direct_light(scene, points, sample, visible, isotropic=plan.isotropic, num_steps=steps)
+    value = throughput * value
     on = jnp.zeros((1, 1), bool) if points.on_surface is None else points.on_surface[:, None]
     return {
         "surface": sums["surface"] + jnp.where(first & on, value, 0.0),
         "volume": sums["volume"] + jnp.where(first & ~on, value, 0.0),
-        "multiple": sums["multiple"] + throughput * total + jnp.where(first, 0.0, value),
+        "multiple": sums["multiple"] + jnp.where(first, 0.0, value),
     }
 
 

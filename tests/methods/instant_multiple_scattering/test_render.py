@@ -1,0 +1,161 @@
+"""The whole method: exact radiance in an infinite medium, claims, plans, scenes in which nothing happens."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvol import layers
+from jaxvol.methods import instant_multiple_scattering as ims
+from jaxvol.methods.instant_multiple_scattering import rendering, upsampling, virtual_lights
+from jaxvol.methods.instant_multiple_scattering.upsampling import Guides
+from jaxvol.types import Mesh, PointLights, Scene
+from tests.methods.instant_multiple_scattering.scenes import floats, lit, make_camera, make_medium
+
+EXACT = 2.27358e-3  # from the Fourier solution; experiments/instant_bias_table.py recomputes it from Case's
+SMALL = {"num_paths": 64, "num_levels": 1, "tile": 64}
+
+
+def test_infinite_medium():
+    """Radiance of light scattered at least twice along a ray past a point source: mean of 64 sets of lights."""
+    medium = make_medium(sigma_s=(0.9,) * 3, sigma_a=(0.1,) * 3, half=20.0)
+    scene = lit(medium, position=(0.0, 1.0, 0.0))
+    plan = ims.plan(scene, make_camera(), num_paths=512, light_stride=1, jitter=False)
+    lanes = 64
+    rays = (
+        jnp.tile(floats([-3.0, 0.0, 0.0]), (lanes, 1)),
+        jnp.tile(floats([1.0, 0.0, 0.0]), (lanes, 1)),
+        jnp.full(lanes, 6.0),
+        jnp.full(lanes, -1),
+        jnp.arange(lanes, dtype=jnp.uint32),
+    )
+    values, sizes = [], {}
+    for k in range(24):
+        context, _ = rendering.make_context(scene, plan, seed=k, sizes=sizes)
+        sizes.update(virtual_lights.sizes(context.lights))
+        found = rendering.gather_rays(context, *rays)
+        values.append(float(jnp.mean(found["volume_from_volume"] + found["volume_from_multiple"])))
+    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    assert error < 0.015 * EXACT
+    assert abs(np.mean(values) - EXACT) < 3.5 * error
+
+
+def test_claims_are_the_six_layers_of_twice_scattered_light():
+    names = [c.name for c in ims.claims(lit(make_medium()))]
+    assert sorted(names) == sorted(rendering.NAMES)
+    assert all(name in layers.NAMES for name in names)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"num_paths": 0}, {"light_stride": 3}, {"end": "open"}, {"mean_free_paths": -1.0}, {"visibility": "maps"}],
+)
+def test_plan_refuses(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        ims.plan(lit(make_medium()), make_camera(), **options)
+
+
+def test_plan_refuses_media_that_bend_rays():
+    medium = dataclasses.replace(make_medium(), ior=jnp.float32(1.3))
+    with pytest.raises(ValueError, match=r"medium\.ior"):
+        ims.plan(lit(medium), make_camera())
+    assert ims.claims(lit(medium)) == ()
+
+
+def test_plan_says_what_it_skips():
+    words = " ".join(ims.plan(lit(make_medium(sigma_s=(0.0,) * 3)), make_camera()).skipped)
+    assert "scatters nothing" in words and "no surfaces" in words
+    thin = ims.plan(lit(make_medium(sigma_s=(0.01,) * 3, sigma_a=(0.0,) * 3)), make_camera())
+    assert any("optically thin" in reason for reason in thin.skipped)
+
+
+@pytest.mark.parametrize("kind", ["no light", "albedo 0", "empty grid", "no medium"])
+def test_scenes_in_which_nothing_scatters_twice_are_black(kind):
+    scene = {
+        "no light": Scene(medium=make_medium()),
+        "albedo 0": lit(make_medium(sigma_s=(0.0,) * 3)),
+        "empty grid": lit(make_medium(density=np.zeros((4, 4, 4)))),
+        "no medium": lit(None),
+    }[kind]
+    camera = make_camera()
+    estimate = ims.render(scene, camera, ims.plan(scene, camera, **SMALL))
+    assert float(jnp.max(layers.total(estimate.mean))) == 0.0
+
+
+def test_float_values_share_a_compilation():
+    camera = make_camera()
+    settings = [lit(make_medium(sigma_s=(s,) * 3, g=0.1 * s)) for s in (0.8, 0.9)]
+    plans = [ims.plan(scene, camera, **SMALL) for scene in settings]
+    from jaxvol.methods.instant_multiple_scattering import gathering
+
+    counts = []
+    sizes = {"volume_first": 128, "volume_later": 128}
+    for scene, plan in zip(settings, plans, strict=True):
+        plan = dataclasses.replace(plan, skipped=(), most_clamp=1.0)
+        rendering.render_set(scene, camera, plan, seed=1, sizes=sizes)
+        counts.append(gathering.gather_segments._cache_size())
+    assert counts[0] == counts[1]
+
+
+def test_surfaces_light_each_other_without_a_medium():
+    """A floor lit by a point light, a wall beside it that the light cannot see: all its light came from the floor."""
+    vertices = floats([-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1], [-1, 0, -1.2], [1, 0, -1.2], [1, 1, -1.2], [-1, 1, -1.2])
+    mesh = Mesh(
+        vertices=vertices,
+        faces=jnp.asarray([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]], jnp.int32),
+        albedo=jnp.full((4, 3), 0.5),
+    )
+    scene = Scene(mesh=mesh, point_lights=PointLights(position=floats([0.0, 1.0, 0.0]), intensity=floats([1.0] * 3)))
+    camera = make_camera()
+    estimate = ims.render(scene, camera, ims.plan(scene, camera, **SMALL))
+    assert float(jnp.mean(estimate.mean.surface_from_surface)) > 0
+    assert float(jnp.max(estimate.mean.surface_from_volume)) == 0.0
+    assert bool(jnp.all(jnp.isfinite(layers.total(estimate.mean))))
+
+
+def guides(n, *, end, source):
+    ones = jnp.ones(n)
+    return Guides(ones, end, ones > 0, ones < 0, jnp.tile(floats([0.0, 0.0, 1.0]), (n, 1)), source, jnp.zeros((n, 3)))
+
+
+def test_a_constant_source_is_reconstructed_exactly():
+    """Radiance of a unit source differs from pixel to pixel; its demodulated value does not."""
+    rng = np.random.default_rng(0)
+    full = jnp.asarray(rng.uniform(0.1, 1.0, (64, 3)), jnp.float32)
+    low = jnp.asarray(rng.uniform(0.1, 1.0, (4, 3)), jnp.float32)
+    value = {"volume_from_volume": 2.5 * low}
+    built, weight = upsampling.reconstruct(
+        value,
+        guides(4, end=jnp.ones(4), source=low),
+        guides(64, end=jnp.ones(64), source=full),
+        height=8,
+        width=8,
+        factor=4,
+    )
+    np.testing.assert_allclose(np.asarray(built["volume_from_volume"]), 2.5 * np.asarray(full), rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(weight), 1.0, rtol=1e-5)
+
+
+def test_pixels_unlike_their_neighbours_are_asked_for_again():
+    far = jnp.ones(64).at[20].set(5.0)
+    ones = jnp.ones((64, 3))
+    _, weight = upsampling.reconstruct(
+        {"volume_from_volume": jnp.ones((4, 3))},
+        guides(4, end=jnp.ones(4), source=jnp.ones((4, 3))),
+        guides(64, end=far, source=ones),
+        height=8,
+        width=8,
+        factor=4,
+    )
+    assert np.flatnonzero(np.asarray(weight) < 0.25).tolist() == [20]
+
+
+def test_low_resolution_evaluates_fewer_pixels():
+    scene, camera = lit(make_medium(sigma_s=(2.0,) * 3), position=(0.0, 2.0, 1.0)), make_camera(16)
+    plan = ims.plan(scene, camera, upsample=4, jitter=False, **SMALL)
+    estimate = ims.render(scene, camera, plan, seed=2)
+    exact = ims.render(scene, camera, dataclasses.replace(plan, upsample=1), seed=2)
+    assert int(estimate.diagnostics["num_evaluated"]) < 200
+    a, b = (float(jnp.mean(layers.total(e.mean))) for e in (estimate, exact))
+    assert a == pytest.approx(b, rel=0.2)
