@@ -57,16 +57,18 @@ def _nodes(a, w, complement, weight) -> HalfAngleNodes:
     """All fields from a, w and pi/2 - s (which must not come from a subtraction)."""
     sin_s, cos_s = np.sin(a + w), np.sin(complement)
     sin_2s = 2 * sin_s * cos_s
+    sin_2a = 2 * np.sin(a) * np.sin(complement + w)  # pi/2 - a = complement + w: no cancellation near 2a = pi
+    sin_2w = 2 * np.sin(w) * np.sin(complement + a)
     return HalfAngleNodes(
         cos_receiver=np.cos(2 * a),
-        sin_receiver=np.sin(2 * a),
+        sin_receiver=sin_2a,
         cos_source=np.cos(2 * w),
-        sin_source=np.sin(2 * w),
+        sin_source=sin_2w,
         sin_s=sin_s,
         cos_s=cos_s,
         excess=2 * np.sin(a) * np.sin(w) / cos_s,
-        receiver_distance=np.sin(2 * w) / sin_2s,
-        source_distance=np.sin(2 * a) / sin_2s,
+        receiver_distance=sin_2w / sin_2s,
+        source_distance=sin_2a / sin_2s,
         weight=weight,
     )
 

@@ -40,7 +40,7 @@ def tabulate(
     from jaxvol.fit import job, table_config, texture
 
     settings = table_config.load(config)
-    chosen = format or (Format(out.suffix[1:]) if out.suffix[1:] in Format else Format.npz)
+    chosen = format or Format._value2member_map_.get(out.suffix[1:], Format.npz)
     if chosen is Format.exr and set(settings.emitters) != {"point", "directional", "area"}:
         raise ValueError("the exr texture holds all three emitters; emitters must name point, directional and area")
     folder = job.parts_folder(out)

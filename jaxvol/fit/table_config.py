@@ -35,7 +35,7 @@ class AreaMultiple(_Table):
     """Resolution of the area emitter's multiple-scattering tables; g, albedo and tau ranges are those of [multiple]."""
 
     num_tau: Nodes = 18
-    num_albedo: Axis = 8
+    num_albedo: Axis = 10
     num_g: Axis = 9
     source_bands: Annotated[int, Field(ge=1, le=24)] = 10  # moments of the patch's emission
 

@@ -19,9 +19,12 @@ def _phase_4pi(cosine: np.ndarray, moments: np.ndarray) -> np.ndarray:
     return legval(cosine, (2 * np.arange(len(moments)) + 1) * moments)
 
 
-def _graded(low: float, high: float, *, toward_low: bool, levels: int = 24, num: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre on panels that halve toward one end."""
+def _graded(
+    low: float, high: float, *, toward_low: bool, levels: int = 24, num: int = 10, refine: int = 7
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre on panels that halve toward one end, the wide ones cut into `refine`."""
     steps = np.concatenate([[0.0], 2.0 ** np.arange(-levels, 1)])
+    steps = np.unique(np.concatenate([steps, np.linspace(0.125, 1, refine + 1)]))
     edges = low + (high - low) * (steps if toward_low else 1 - steps[::-1])
     node, weight = leggauss(num)
     half = np.diff(edges)[:, None] / 2
@@ -34,22 +37,23 @@ def physical_response(
     """L_l (L_lm, half index, given theta_n) of light scattered once, in physical units, straight from the rendering equation.
 
     Fixed graded Gauss-Legendre over the viewing angle gamma and the position on the ray, t = d cos gamma + h tan y. Relative
-    error 1e-12; with theta_n 1e-5 (the clamped cosine's kinks are not resolved).
+    error 1e-12; with theta_n 1e-5 of L_00.
     """
     gamma, gamma_weight = (
         np.concatenate(v) for v in zip(_graded(0, pi / 2, toward_low=True), _graded(pi / 2, pi, toward_low=False), strict=True)
     )
     bands = harmonics.half_index(order)
+    refine = 7 if theta_n is None else 56  # the clamped cosine has kinks
     polynomials = harmonics.normalised_legendre(np.cos(gamma), order)
     result = np.zeros(len(bands))
     for i, angle in enumerate(gamma):
-        rest, weight = _graded(0, pi - angle, toward_low=True, levels=40 if angle < 0.1 else 24)  # pi/2 - y
+        rest, weight = _graded(0, pi - angle, toward_low=True, levels=40 if angle < 0.1 else 24, refine=refine)  # pi/2 - y
         height = distance * np.sin(angle)
         t = np.maximum(height / np.tan(rest) + distance * np.cos(angle), 0)
         r = height / np.sin(rest)
         scatter = sigma_s * _phase_4pi(-np.cos(rest), moments) / (4 * pi) * np.exp(-sigma_t * (t + r)) * weight / height
         if theta_n is None:
-            emission = np.full((1, y.size), 1.0)
+            emission = np.ones((1, rest.size))
         else:
             emission = _lit_azimuths(theta_n, pi - angle - rest, order)[[m for _, m in bands]]
         seen = 2 * pi * np.sin(angle) * gamma_weight[i] * (emission @ scatter)
