@@ -85,8 +85,8 @@ def test_single_disk_on_the_axis_of_a_homogeneous_ray():
     wall = make_mesh([([-side / 2, -side / 2, -1.5], [side, 0, 0], [0, side, 0])], [[0.8, 0.8, 0.8]])
     scene = Scene(mesh=wall, medium=make_medium(0.6, 0.2, half=1.0), point_lights=lamp(2.0, (0.0, 0.0, 1.5)))
     view = Camera(cameras.look_at([0.0, 0.0, 4.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]), jnp.float32(1e-4), 1, 1)
-    plan = method.plan(scene, view, **(ALL_PAIRS | {"num_surfels": 512, "num_intervals": 64, "cluster_size": 512}))
-    found = image(scene, view, **(ALL_PAIRS | {"num_surfels": 512, "num_intervals": 64}))
+    plan = method.plan(scene, view, **(ALL_PAIRS | {"num_surfels": 512, "num_intervals": 64, "table_resolution": 64}))
+    found = image(scene, view, **(ALL_PAIRS | {"num_surfels": 512, "num_intervals": 64, "table_resolution": 64}))
     assert plan.active
     z = -1 + (np.arange(20000) + 0.5) * 2 / 20000
     sigma = 0.8
