@@ -37,6 +37,10 @@ def read_vol(path: str | os.PathLike) -> Volume:
 
 
 def write_vol(path: str | os.PathLike, volume: Volume) -> None:
-    """Write a `.vol` file, atomically; bounds are rounded to float32. Raises OSError."""
-    head = _HEADER.pack(b"VOL", 3, _FLOAT32, *volume.density.shape, 1, *volume.bounds.ravel())
-    jobs.write_bytes(path, head + np.ascontiguousarray(volume.density.transpose(2, 1, 0), "<f4").tobytes())
+    """Write a `.vol` file, atomically; bounds are rounded to float32. Raises OSError.
+
+    A density of four axes [x, y, z, channel] makes a file of several channels, which Mitsuba takes for colours.
+    """
+    grid = volume.density if volume.density.ndim == 4 else volume.density[..., None]
+    head = _HEADER.pack(b"VOL", 3, _FLOAT32, *grid.shape, *volume.bounds.ravel())
+    jobs.write_bytes(path, head + np.ascontiguousarray(grid.transpose(2, 1, 0, 3), "<f4").tobytes())
