@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxvol.methods.lattice_boltzmann import fine_sweeps, light_rays, marching, preconditioner
+from jaxvol.methods.lattice_boltzmann import fine_sweeps, fresnel, light_rays, marching, preconditioner
 from jaxvol.methods.lattice_boltzmann import materials as material_pass
 from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice
 from jaxvol.methods.lattice_boltzmann.materials import Materials
 from jaxvol.methods.lattice_boltzmann.planning import Plan
+from jaxvol.methods.lattice_boltzmann.refraction import body_entry
 from jaxvol.methods.lattice_boltzmann.solver import solve
 from jaxvol.methods.lattice_boltzmann.sweeps import transport
 from jaxvol.types import Scene
@@ -38,12 +39,16 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     low = np.asarray(grid.lower, float)
     high = low + float(grid.voxel) * np.array(grid.shape)
     rays = light_rays.from_lights(scene, low, high, float(grid.voxel), rays_per_voxel=plan.rays_per_voxel, seed=seed)
+    if plan.refract:
+        rays = enter_body(scene, rays)
     power, spectrum = _channels(rays.power, plan.num_channels)
     marched = march(materials, plan, rays, power, seed)
     track, books = marched.track, [marched]
     from_surface = None
     if plan.num_surface_rays:
         bounced = light_rays.reflected(scene, low, high, count=plan.num_surface_rays, seed=seed)
+        if plan.refract:
+            bounced = enter_body(scene, bounced)
         surface_power = bounced.power if plan.num_channels == 3 else (bounced.power @ spectrum / (spectrum @ spectrum))[:, None]
         second = march(materials, plan, bounced, surface_power, seed)
         from_surface = second.track
@@ -76,6 +81,21 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
         "num_ray_steps": jnp.asarray(sum(b.num_steps for b in books), jnp.float32),
     }
     return Illumination(materials, spectrum, track, from_surface, from_volume, scattered, diagnostics)
+
+
+def enter_body(scene: Scene, rays: light_rays.LightRays) -> light_rays.LightRays:
+    """The rays that meet the body, less Fresnel's reflection at its surface; rays that start inside stay as they are.
+
+    Rays that only pass through the smoothed index around the body are left out: they would make it larger.
+    """
+    t, normal = body_entry(scene, rays.origin, rays.direction, rays.t_max)
+    cosine = np.sum(normal * rays.direction, axis=1)
+    index = scene.medium.ior
+    mirror = 0.0 if index is None else np.asarray(fresnel.reflectance(jnp.abs(cosine), float(np.max(np.asarray(index)))))
+    passed = np.where(cosine > 0, 1.0, 1.0 - mirror)
+    kept = np.isfinite(t)
+    power = (rays.power * passed[:, None]).astype(np.float32)
+    return light_rays.LightRays(rays.origin[kept], rays.direction[kept], power[kept], rays.t_max[kept])
 
 
 def march(materials: Materials, plan: Plan, rays: light_rays.LightRays, power: np.ndarray, seed: int) -> marching.Marched:
