@@ -105,6 +105,7 @@ def _tau_basis(tau, limits, num):
 
 def _side_basis(theta, num: int):
     """Basis of the side of pi/2 that holds theta, zero on the other: `[*batch, 2, num]`."""
+    theta = jnp.asarray(theta)
     off = jnp.abs(theta - pi / 2) / (pi / 2)
     far = off > 1e-6  # keeps the gradient of the root finite
     x = jnp.clip(2 * jnp.where(far, jnp.sqrt(jnp.where(far, off, 1)), 0) - 1, -1, 1)

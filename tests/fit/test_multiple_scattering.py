@@ -17,14 +17,14 @@ def fluence(tau, **keywords):
 
 @pytest.mark.parametrize("k", problems.BOUNCES)
 def test_closed_form_of_bounces(k):
-    np.testing.assert_allclose(green.fluence_bounce(RADII, k), problems.BOUNCES[k], rtol=2e-9)
+    np.testing.assert_allclose(green.fluence_bounce(RADII, k), problems.BOUNCES[k], rtol=6e-9)  # nine printed digits
 
 
 @pytest.mark.parametrize("albedo", problems.TOTAL)
 def test_closed_form_of_the_sum(albedo):
     kappa, values = problems.TOTAL[albedo]
     assert abs(green.diffusion_root(albedo) - kappa) < 1e-10
-    np.testing.assert_allclose(green.fluence_total(RADII, albedo), values, rtol=2e-9)
+    np.testing.assert_allclose(green.fluence_total(RADII, albedo), values, rtol=6e-9)  # nine printed digits
     power_one = green.fluence_total(np.array([0.5, 1, 2, 5, 10]), albedo) / (4 * np.pi)
     np.testing.assert_allclose(power_one, problems.TOTAL_T2[albedo], rtol=5e-8)
 
@@ -147,7 +147,7 @@ def test_area_bounces_by_source_moments():
 
 
 def test_reciprocity_of_source_and_receiver_moments():
-    """R_lkm = (-1)^(l+k) R_klm in frames along the light: here both frames point at each other, which absorbs the sign."""
+    """R_lkm = R_klm: source and receiver may be swapped, as their frames look at each other."""
     response = wavenumber.moment_responses(
         [0.7], moments=wavenumber.effective_moments(0.6), albedo=0.8, source_bands=(0, 1, 2, 3), order=4
     )[0]
