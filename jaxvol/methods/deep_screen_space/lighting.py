@@ -57,24 +57,21 @@ def light_choices(scene: Scene, *, num_area_samples: int, num_environment_sample
 def connect(scene: Scene, surfels: Surfels, seed, *, choices: tuple[tuple[int, int], ...]) -> Connections:
     """Directions towards the lights; per light a Kronecker sequence over its samples, shifted per surfel."""
     number = lights.num_lights(scene)
-    num_surfels = surfels.area.shape[0]
-    shift = sampling.uniforms(seed, _STREAM, jnp.arange(num_surfels), 0)
-    found = []
-    for choice, samples in choices:
-        for k in range(samples):
-            # Roots of the plastic number's cubic: the R3 sequence of low discrepancy (Roberts 2018).
-            u1, u2, u3 = (
-                _open((shift[i] + (k + 1) * ratio) % 1.0)
-                for i, ratio in enumerate((0.8191725134, 0.6710436067, 0.5497004779))
-            )
-            light = lights.sample_light(scene, surfels.position, u1, u2, (choice + u3) / number)
-            cosine = sampling.dot(surfels.normal, light.direction)
-            # sample_light's pdf holds the choice among `number` lights; here that light is certain, sampled `samples` times
-            scale = jnp.abs(cosine) / (light.pdf * number * samples)
-            scale = jnp.where(surfels.valid & (light.pdf > 0), scale, 0.0)
-            found.append((light.direction, light.distance, light.radiance * scale[:, None]))
-    direction, distance, irradiance = (jnp.stack(part) for part in zip(*found, strict=True))
-    return Connections(direction=direction, distance=distance, irradiance=irradiance)
+    shift = sampling.uniforms(seed, _STREAM, jnp.arange(surfels.area.shape[0]), 0)
+    rows = [(choice, samples, k) for choice, samples in choices for k in range(samples)]
+    choice, samples, k = (jnp.asarray(column, jnp.float32)[:, None] for column in zip(*rows, strict=True))  # [K, 1]
+    # Powers of the root of x^4 = x + 1: the R3 sequence of low discrepancy (Roberts 2018).
+    u1, u2, u3 = (
+        _open((u + (k + 1.0) * ratio) % 1.0)
+        for u, ratio in zip(shift, (0.8191725134, 0.6710436067, 0.5497004779), strict=False)
+    )
+    position = jnp.broadcast_to(surfels.position, (*u1.shape, 3))
+    light = lights.sample_light(scene, position, u1, u2, (choice + u3) / number)
+    cosine = sampling.dot(surfels.normal, light.direction)
+    # sample_light's pdf holds the choice among `number` lights; here that light is certain, sampled `samples` times.
+    scale = jnp.abs(cosine) / jnp.maximum(light.pdf * number * samples, 1e-30)
+    scale = jnp.where(surfels.valid & (light.pdf > 0), scale, 0.0)
+    return Connections(light.direction, light.distance, light.radiance * scale[..., None])
 
 
 def _open(u):

@@ -166,7 +166,7 @@ def splat(
     num_tiles, num_samples, size = rays.distance.shape
     group_size = surfels.row.shape[1]
     # With its own g every sample's weight holds the phase function's factor already.
-    factor = kernel.phase_scale(phase, g) if rays.g is None else 1.0
+    scale = kernel.phase_scale(phase, g) if rays.g is None else 1.0
 
     def one_batch(index, images):
         chosen = index * batch + jnp.arange(batch)
@@ -177,37 +177,31 @@ def splat(
         direction = _rows(rays.direction, safe)
         ray = (direction[:, 0], direction[:, 1], direction[:, 2])
         distance = _rows(rays.distance, safe)
-        distances = [distance[:, n] for n in range(num_samples)]
-        factors = None
+        along = lambda values: [values[:, n] for n in range(num_samples)]  # noqa: E731
+        factor = None
         if transport is not None:
-            cells = _rows(rays.cell, safe)
-            cluster = _rows(surfels.cluster, k)[:, None] * transport.shape[2]
-            factors = [
-                [_rows(channel.reshape(-1), cluster + cells[:, n]) for n in range(num_samples)] for channel in transport
-            ]
-        mean_cosine = g
-        if rays.g is not None:
-            cosines = _rows(rays.g, safe)
-            mean_cosine = [cosines[:, n] for n in range(num_samples)]
+            channels, _, num_cells = transport.shape
+            place = _rows(surfels.cluster, k)[:, None, None] * num_cells + _rows(rays.cell, safe)
+            factor = [_rows(transport[c].reshape(-1), place) for c in range(channels)]
+        mean_cosine = g if rays.g is None else along(_rows(rays.g, safe))
         if rays.weight is not None:
             weight = _rows(rays.weight, safe)
-            weights = [[weight[:, n, c] for n in range(num_samples)] for c in range(3)]
-            if factors is not None:
-                weights = [
-                    [w * f for w, f in zip(weights[c], factors[c % len(factors)], strict=True)] for c in range(3)
-                ]
+            weights = [weight[:, :, c] if factor is None else weight[:, :, c] * factor[c % len(factor)] for c in range(3)]
+            weights = [along(channel) for channel in weights]
+        elif factor is not None:
+            factor = along(factor[0])
         rows = _rows(surfels.row, k)
 
         def one_surfel(m, sums):
             row = lax.dynamic_index_in_dim(rows, m, 1, keepdims=False)
             surfel = {name: row[:, i : i + 1] for i, name in enumerate(names)}
-            values = kernel.pair_samples(ray, distances, surfel, phase=phase, g=mean_cosine, table=table)
+            values = kernel.pair_samples(ray, along(distance), surfel, phase=phase, g=mean_cosine, table=table)
             colours = [surfel[name] for name in ("red", "green", "blue")]
             if rays.weight is not None:
                 totals = [sum(v * w for v, w in zip(values, channel, strict=True)) for channel in weights]
                 return tuple(s + c * total for s, c, total in zip(sums, colours, totals, strict=True))
-            if factors is not None:
-                values = [v * f for v, f in zip(values, factors[0], strict=True)]
+            if factor is not None:
+                values = [v * f for v, f in zip(values, factor, strict=True)]
             total = sum(values[1:], start=values[0])
             return tuple(s + c * total for s, c in zip(sums, colours, strict=True))
 
@@ -218,4 +212,4 @@ def splat(
     blank = jnp.zeros((num_tiles, size), jnp.float32)
     num_batches = (num_pairs + batch - 1) // batch
     images = lax.fori_loop(0, num_batches, one_batch, (blank, blank, blank))
-    return factor * jnp.stack(images, axis=1)
+    return scale * jnp.stack(images, axis=1)
