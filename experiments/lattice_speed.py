@@ -1,0 +1,64 @@
+"""Warm run time, by stage, of an RGB picture of the translucent bunny: 128 voxels, 512x512, default lattice; and each saving.
+
+    python experiments/lattice_speed.py [--resolution 128] [--size 512] [--savings 1]
+
+Savings, at half the resolution: one channel for grey media, dead rays packed away, no lattice where nothing scatters.
+"""
+
+import os
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from lattice_common import HERE, arguments, timed, write_csv
+
+from jaxvol.methods import lattice_boltzmann
+from jaxvol.scene import load_scene
+
+
+def run(scene, camera, plan, label):
+    """One warm rendering: seconds by stage, CPU and wall."""
+    lattice_boltzmann.render(scene, camera, plan, seed=0)
+    stages, last = {}, [time.process_time(), time.perf_counter()]
+
+    def on_stage(name):
+        now = [time.process_time(), time.perf_counter()]
+        stages[name] = (now[0] - last[0], now[1] - last[1])
+        last[:] = now
+
+    with timed() as spent:
+        found = jax.block_until_ready(lattice_boltzmann.render(scene, camera, plan, seed=0, on_stage=on_stage))
+    row = {"case": label, "channels": plan.num_channels, "cpu_s": spent.cpu, "wall_s": spent.wall, "load": os.getloadavg()[0]}
+    row |= {f"{name}_cpu_s": stages[name][0] for name in ("voxelize", "march", "solve", "view")}
+    row["ray_steps"] = float(found.diagnostics["num_ray_steps"])
+    row["applications"] = str(np.asarray(found.diagnostics["num_applications"]))
+    return row
+
+
+def main():
+    chosen = arguments(__doc__, resolution=128, size=512, samples=1, savings=1)
+    overrides = [f"camera.width={chosen.size}", f"camera.height={chosen.size}"]
+    file = load_scene(HERE / "lattice_bunny.toml", overrides=overrides)
+    options = {"samples_per_pixel": chosen.samples}
+    rows = [run(file.scene, file.camera, lattice_boltzmann.plan(file.scene, file.camera, resolution=chosen.resolution, **options), "RGB")]
+    write_csv(chosen.out / "speed.csv", rows)
+    if chosen.savings:
+        half = chosen.resolution // 2
+        grey = eqx.tree_at(
+            lambda s: (s.medium.sigma_s, s.medium.sigma_a, s.environment), file.scene,
+            (jnp.full(3, 90.0), jnp.full(3, 1.5), None), is_leaf=lambda x: x is None,
+        )  # fmt: skip
+        clear = eqx.tree_at(lambda s: (s.medium.sigma_s, s.medium.sigma_a), grey, (jnp.zeros(3), jnp.full(3, 0.5)))
+        dense = eqx.tree_at(lambda s: (s.medium.sigma_s, s.medium.sigma_a), grey, (jnp.full(3, 400.0), jnp.full(3, 4.0)))
+        for label, scene in (("grey", grey), ("nothing scatters", clear), ("four times denser: rays die early", dense)):
+            plan = lattice_boltzmann.plan(scene, file.camera, resolution=half, **options)
+            rows.append(run(scene, file.camera, plan, label))
+        plan = lattice_boltzmann.plan(grey, file.camera, resolution=half, specialize="structure", **options)
+        rows.append(run(grey, file.camera, plan, "grey, solved as three channels"))
+        write_csv(chosen.out / "speed.csv", rows)
+
+
+if __name__ == "__main__":
+    main()
