@@ -55,7 +55,12 @@ def main():
         relmse = image.relmse(picture, total, variance=total_variance)
         # the path tracer's relMSE falls as 1 / samples
         pt_relmse = float(np.mean(total_variance / (total**2 + 0.01 * np.mean(total) ** 2)))
-        row |= {"relmse": relmse, "pt_relmse": pt_relmse, "pt_cpu_s": pt_cpu, "pt_cpu_at_equal_relmse": pt_cpu * pt_relmse / relmse}
+        row |= {
+            "relmse": relmse,
+            "pt_relmse": pt_relmse,
+            "pt_cpu_s": pt_cpu,
+            "pt_cpu_at_equal_relmse": pt_cpu * pt_relmse / relmse,
+        }
         for k, name in enumerate(LAYERS):
             row[f"l1_{name}"] = image.relative_l1(np.asarray(getattr(found.mean, name)), mean[k], block=chosen.block)
         rows.append(row)

@@ -99,7 +99,15 @@ def blocks(size=32):
             for exchanges in (10, 20, 40, 80, 160):
                 found = run(lat, co, albedo * source, num_exchanges=exchanges, inner=inner)
                 error = float(jnp.linalg.norm(found.phi - exact) / jnp.linalg.norm(exact))
-                rows.append({"albedo": albedo, "inner_steps": inner, "exchanges": exchanges, "steps": exchanges * (inner + 1), "error": error})
+                rows.append(
+                    {
+                        "albedo": albedo,
+                        "inner_steps": inner,
+                        "exchanges": exchanges,
+                        "steps": exchanges * (inner + 1),
+                        "error": error,
+                    }
+                )
     return rows
 
 

@@ -94,7 +94,10 @@ def figure6(size, resolution):
     for sigma in (4.0, 16.0, 48.0):
         for albedo in (0.8, 0.98):
             medium = body(ball, sigma * albedo, sigma * (1 - albedo), ior=1.3)
-            yield f"sigma_t {sigma:g}, albedo {albedo:g}", shot(Scene(medium=medium, spot_lights=lamp), camera(size), resolution)
+            yield (
+                f"sigma_t {sigma:g}, albedo {albedo:g}",
+                shot(Scene(medium=medium, spot_lights=lamp), camera(size), resolution),
+            )
 
 
 def figure7(size, resolution):
@@ -118,7 +121,10 @@ def figure10(size, resolution):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     lamp = spot_light((0.3, 1.6, 0.6))
     inside = body(cow, [10.0, 8.0, 6.0], 0.1, ior=1.5)
-    yield "cow in a sphere", shot(Scene(medium=body(ball, 0.6, 0.02, ior=1.1, inclusions=[inside]), spot_lights=lamp), camera(size), resolution)
+    yield (
+        "cow in a sphere",
+        shot(Scene(medium=body(ball, 0.6, 0.02, ior=1.1, inclusions=[inside]), spot_lights=lamp), camera(size), resolution),
+    )
     cube = trimesh.creation.box(extents=[1, 1, 1])
     balls = []
     for x, ior in ((-0.22, 1.6), (0.22, 1.3)):
@@ -148,7 +154,11 @@ def sky(height=32):
     phi = (np.arange(2 * height)[None] + 0.5) / height * math.pi
     up = np.cos(theta) + 0 * phi
     warm = np.exp(-((phi - 1.5) ** 2) / 0.3) * np.exp(-((theta - 1.2) ** 2) / 0.2)
-    radiance = 0.15 + 0.35 * np.clip(up, 0, 1)[..., None] * np.array([0.5, 0.7, 1.0]) + 2.0 * warm[..., None] * np.array([1.0, 0.7, 0.4])
+    radiance = (
+        0.15
+        + 0.35 * np.clip(up, 0, 1)[..., None] * np.array([0.5, 0.7, 1.0])
+        + 2.0 * warm[..., None] * np.array([1.0, 0.7, 0.4])
+    )
     return light_types.environment_light(radiance)
 
 
@@ -162,7 +172,10 @@ def figure11(size, resolution):
     cube, rabbit = trimesh.creation.box(extents=[1, 1, 1]), solid("bunny")
     rabbit.apply_scale(0.75)
     medium = body(cube, 0.1, 0.01, ior=1.1, inclusions=[body(rabbit, [8.0, 6.0, 4.0], 0.1, ior=1.5)])
-    yield "bunny in a cube", shot(Scene(medium=medium, environment=sky()), camera(size, (0.9, 0.6, 2.6)), resolution, whole=True)
+    yield (
+        "bunny in a cube",
+        shot(Scene(medium=medium, environment=sky()), camera(size, (0.9, 0.6, 2.6)), resolution, whole=True),
+    )
 
 
 def figure12(size, resolution):
@@ -187,7 +200,8 @@ def main():
             titles.append(title)
             rows.append({
                 "figure": number, "title": title, "cpu_s": spent.cpu, "wall_s": spent.wall,
-                "applications": int(np.max(diagnostics["num_applications"])), "residual": float(np.max(diagnostics["residual"])),
+                "applications": int(np.max(diagnostics["num_applications"])),
+                "residual": float(np.max(diagnostics["residual"])),
             })  # fmt: skip
         write_csv(chosen.out / f"figure{number}.csv", rows)
         pictures(chosen.out / f"figure{number}.png", images, titles)

@@ -42,7 +42,14 @@ def main():
     overrides = [f"camera.width={chosen.size}", f"camera.height={chosen.size}"]
     file = load_scene(HERE / "lattice_bunny.toml", overrides=overrides)
     options = {"samples_per_pixel": chosen.samples}
-    rows = [run(file.scene, file.camera, lattice_boltzmann.plan(file.scene, file.camera, resolution=chosen.resolution, **options), "RGB")]
+    rows = [
+        run(
+            file.scene,
+            file.camera,
+            lattice_boltzmann.plan(file.scene, file.camera, resolution=chosen.resolution, **options),
+            "RGB",
+        )
+    ]
     write_csv(chosen.out / "speed.csv", rows)
     if chosen.savings:
         half = chosen.resolution // 2

@@ -7,8 +7,8 @@ inside a voxel attenuation and source are exact for constant sigma. `correct` th
 defect correction: phi <- phi + (I - B26 k)^-1 (B80 (k phi + b) - phi), one or two of them, each a lattice solve.
 """
 
-import numpy as np
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 

@@ -59,7 +59,9 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     first = materials.scattering * track
     wall = None
     if plan.internal_reflectance > 0:
-        wall = ~(materials.body if materials.body is not None else jnp.any(materials.scattering + materials.absorption > 0, axis=0))
+        wall = ~(
+            materials.body if materials.body is not None else jnp.any(materials.scattering + materials.absorption > 0, axis=0)
+        )
     if plan.solve:
         results = [
             _channel(materials.scattering[c], materials.absorption[c], deposit[c], first[c], wall, plan)
@@ -124,7 +126,9 @@ def _channel(scattering, absorption, deposit, first, wall, plan):
         deposit, first = (jnp.where(wall, 0.0, x) for x in (deposit, first))
     if not plan.corrections:
         answer = solve_channel(scattering, absorption, deposit, wall, plan.internal_reflectance, plan=plan)
-        from_volume = answer.phi_first if not plan.num_surface_rays else lattice_transport(scattering, absorption, first, wall, plan=plan)
+        from_volume = (
+            answer.phi_first if not plan.num_surface_rays else lattice_transport(scattering, absorption, first, wall, plan=plan)
+        )
         return from_volume, answer.phi, answer.num_applications, answer.residual, answer.converged
     extinction = scattering + absorption
     phi = jnp.zeros_like(deposit)

@@ -202,8 +202,12 @@ def reflected(scene: Scene, low: np.ndarray, high: np.ndarray, *, count: int, se
     power = np.asarray(sent.power, float) / count
     if scene.medium is not None:
         thickness = extinction.optical_thickness(
-            scene.medium, start, way, np.where(np.isfinite(t), t, 0.0).astype(np.float32),
-            casters=segments.medium_casters(scene.medium), num_steps=64,
+            scene.medium,
+            start,
+            way,
+            np.where(np.isfinite(t), t, 0.0).astype(np.float32),
+            casters=segments.medium_casters(scene.medium),
+            num_steps=64,
         )
         power = power * np.exp(-np.asarray(thickness, float))
     surface = materials.surface_at(scene.mesh, jnp.maximum(hits.face, 0))

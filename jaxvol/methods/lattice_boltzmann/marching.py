@@ -3,7 +3,8 @@
 Straight media: from voxel face to voxel face, exact lengths, exact exponentials. Refractive media: Hamilton's equations
 of the eikonal in voxel units, dx/dtau = p, dp/dtau = D = grad (n^2/2), by leapfrog (drift, kick, drift; ds = n dtau),
 with the energy put back along the gradient so that |p| = n (planar Snell then holds at any step); "smooth" leaves the
-energy alone, for gradients that stretch over many voxels; "euler" is the paper's eq. 2-3. Fig. 4 of the paper mixes two forms (v += delta grad n / n), does not converge, and is not offered.
+energy alone, for gradients that stretch over many voxels; "euler" is the paper's eq. 2-3. Fig. 4 of the paper mixes two
+forms (v += delta grad n / n), does not converge, and is not offered.
 
 Deposited is the track, power times length in voxels: the fluence times h^2 [W] of light that comes from the lights. A
 voxel scatters scattering * track and absorbs absorption * track, exactly what the ray loses, so that
@@ -170,7 +171,7 @@ def _run(advance, rays, track, books, max_rounds=400):
         kept = np.flatnonzero(moving & strong)
         if len(kept) == 0:
             return track
-        rays = jax.tree.map(lambda x: np.asarray(x)[kept], rays)
+        rays = jax.tree.map(lambda x, k=kept: np.asarray(x)[k], rays)
     books.live += np.stack([np.asarray(p) for p in rays.power], 1).sum(0, dtype=np.float64)
     return track
 
@@ -314,7 +315,9 @@ def _bent_round(extinction, table, shape, step, integrator, rays, track):
     def body(_, carry):
         rays, track = carry
         index = jnp.maximum(rays.index, 1.0)
-        position, momentum, n, middle = advance(lambda x: interpolate(table, shape, x), rays.position, rays.momentum, index, step)
+        position, momentum, n, middle = advance(
+            lambda x: interpolate(table, shape, x), rays.position, rays.momentum, index, step
+        )
         voxel = jnp.clip(middle.astype(jnp.int32), 0, jnp.asarray(shape, jnp.int32) - 1)
         at = (voxel[:, 0] * shape[1] + voxel[:, 1]) * shape[2] + voxel[:, 2]
         power, track = _absorb(extinction, track, rays.power, at, jnp.where(rays.inside, step, 0.0))

@@ -154,9 +154,7 @@ def _density(marching, number, bounds, shape):
 def _index(part, bounds, shape):
     if jnp.ndim(part.ior) == 0:
         return np.float32(part.ior)
-    centers = [
-        bounds[0, a] + (np.arange(shape[a]) + 0.5) * (bounds[1, a] - bounds[0, a]) / shape[a] for a in range(3)
-    ]
+    centers = [bounds[0, a] + (np.arange(shape[a]) + 0.5) * (bounds[1, a] - bounds[0, a]) / shape[a] for a in range(3)]
     points = np.stack(np.meshgrid(*centers, indexing="ij"), -1).astype(np.float32)
     low, high = np.asarray(part.bounds)
     carrier = eqx.tree_at(lambda m: m.density, part, part.ior, is_leaf=lambda x: x is None)

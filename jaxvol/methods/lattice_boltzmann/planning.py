@@ -57,12 +57,20 @@ def claims(scene: Scene) -> tuple[Claim, ...]:
         partial = bent if partial is None else f"{partial}; {bent}"
     one = bent if refract else None
     if media.is_isotropic(scene.medium):
-        found = [Claim(("volume_from_light",), one), Claim(("volume_from_volume",), one), Claim(("volume_from_multiple",), partial)]
+        found = [
+            Claim(("volume_from_light",), one),
+            Claim(("volume_from_volume",), one),
+            Claim(("volume_from_multiple",), partial),
+        ]
     else:
         similar = "anisotropy by similarity: right in total only where light scatters often"
         found = [Claim(_SUM, similar if partial is None else f"{partial}; {similar}")]
     if surfaces:
-        found.append(Claim(("volume_from_surface",), "Lambertian part of the reflection only" if scene.mesh.specular is not None else one))
+        found.append(
+            Claim(
+                ("volume_from_surface",), "Lambertian part of the reflection only" if scene.mesh.specular is not None else one
+            )
+        )
     if refract:
         found.append(Claim(("emission",), "reflection inside the medium is missed"))
         found.append(Claim(("surface_from_light",), _SKY))
@@ -70,7 +78,9 @@ def claims(scene: Scene) -> tuple[Claim, ...]:
 
 
 def _refracts(scene):
-    return any(part.ior is not None and float(np.max(np.abs(np.asarray(part.ior) - 1.0))) > 1e-4 for part in regions(scene.medium))
+    return any(
+        part.ior is not None and float(np.max(np.abs(np.asarray(part.ior) - 1.0))) > 1e-4 for part in regions(scene.medium)
+    )
 
 
 def plan(
@@ -129,7 +139,9 @@ def plan(
     thickest = _thickest(scene, scattering + absorption) * voxel
     if thickest > _THICK:
         enough = math.ceil(resolution * thickest / _THICK)
-        skipped.append(f"warning: sigma_t' h = {thickest:.2g} is coarse for the lattice; resolution = {enough} would bring it to {_THICK:g}")
+        skipped.append(
+            f"warning: sigma_t' h = {thickest:.2g} is coarse for the lattice; resolution = {enough} brings it to {_THICK:g}"
+        )
     if probability_map == "auto":
         probability_map = "exp" if thickest > 2.0 else "pade"
     if integrator == "auto":
@@ -141,7 +153,11 @@ def plan(
         skipped.append("nothing scatters: no lattice")
     internal = boundary_reflectance
     if internal is None:
-        internal = fresnel.diffuse_internal(float(np.max(np.asarray(scene.medium.ior)))) if refract and scene.medium.ior is not None else 0.0
+        internal = (
+            fresnel.diffuse_internal(float(np.max(np.asarray(scene.medium.ior))))
+            if refract and scene.medium.ior is not None
+            else 0.0
+        )
     if corrections is None:
         corrections = 2 if lattice == "26" and internal == 0 else 0
     if corrections and internal > 0:

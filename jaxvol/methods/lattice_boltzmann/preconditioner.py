@@ -32,9 +32,7 @@ class Level(NamedTuple):
     diagonal: Float[Array, "X Y Z"]
 
 
-def build(
-    shape: tuple[int, int, int], extinction: Float[Array, "..."], absorption: Float[Array, "..."]
-) -> tuple[Level, ...]:
+def build(shape: tuple[int, int, int], extinction: Float[Array, "..."], absorption: Float[Array, "..."]) -> tuple[Level, ...]:
     """The grids of the V-cycle, finest first, from sigma_t h and sigma_a h (scalars or [X, Y, Z])."""
     extinction = jnp.broadcast_to(jnp.asarray(extinction, jnp.float32), shape)
     sink = jnp.broadcast_to(jnp.asarray(absorption, jnp.float32), shape)

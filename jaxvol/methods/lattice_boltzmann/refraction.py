@@ -40,7 +40,9 @@ def radiance_bent(scene: Scene, plan, materials, table, origin, direction, t_max
     ahead = np.flatnonzero(misses)
     point = origin[enters] + direction[enters] * t_entry[enters, None]
     mirrored = direction[enters] + 2.0 * cosine[:, None] * _facing(normal[enters], direction[enters])
-    origins = np.concatenate([origin[ahead], exits, point + 1e-3 * float(grid.voxel) * _facing(normal[enters], direction[enters])])
+    origins = np.concatenate(
+        [origin[ahead], exits, point + 1e-3 * float(grid.voxel) * _facing(normal[enters], direction[enters])]
+    )
     headings = np.concatenate([direction[ahead], heading, mirrored])
     reach = np.concatenate([t_max[ahead], np.full(2 * len(enters), np.inf, np.float32)])
     seen = _background(scene, origins, headings, reach, seed)

@@ -18,9 +18,7 @@ _TO_AXIS = {0: (0, 1, 2), 1: (1, 0, 2), 2: (2, 0, 1)}  # transposition that make
 _FROM_AXIS = {0: (0, 1, 2), 1: (1, 0, 2), 2: (1, 2, 0)}
 
 
-def transport(
-    lattice: Lattice, coefficients: Coefficients, source: Float[Array, "X Y Z"]
-) -> Float[Array, "X Y Z"]:
+def transport(lattice: Lattice, coefficients: Coefficients, source: Float[Array, "X Y Z"]) -> Float[Array, "X Y Z"]:
     """phi = B s: the fluence times h^2 [W] that an isotropic source s [W per voxel] makes without any further scattering."""
     phi = coefficients.own * source
     for axis in range(3):

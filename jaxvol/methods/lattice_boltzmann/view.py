@@ -51,9 +51,11 @@ def gather_straight(
     through = np.ones((len(origin), num_channels), np.float32)
     if len(origin) == 0:
         return radiance, through
-    pieces = segments.segments(
-        medium, *(jnp.asarray(x, jnp.float32) for x in (origin, direction, t_max)), casters=casters
-    ) if segments.is_box(medium) else segments.segments(medium, origin, direction, t_max, casters=casters)
+    pieces = (
+        segments.segments(medium, *(jnp.asarray(x, jnp.float32) for x in (origin, direction, t_max)), casters=casters)
+        if segments.is_box(medium)
+        else segments.segments(medium, origin, direction, t_max, casters=casters)
+    )
     t, region = np.asarray(pieces.t), np.asarray(pieces.region)
     length = np.where((region >= 0).any(1), t[:, -1] - t[:, 0], 0.0)
     order = np.argsort(length)

@@ -101,13 +101,11 @@ def test_preconditioner_is_symmetric_and_positive(medium):
 
 
 def test_diffuse_walls_conserve_and_close():
-    """What enters a wall voxel comes back in the share of its reflectance: a closed white box with absorption escapes nothing."""
+    """From a closed white box with absorption nothing escapes."""
     shape = (6, 6, 6)
     wall = jnp.ones(shape, bool).at[1:-1, 1:-1, 1:-1].set(False)
     deposit = jnp.zeros(shape).at[2, 3, 3].set(1.0)
-    co = coefficients(
-        LATTICES["26"], jnp.full(shape, 0.3), jnp.full(shape, 0.1), wall=wall, wall_reflectance=1.0
-    )
+    co = coefficients(LATTICES["26"], jnp.full(shape, 0.3), jnp.full(shape, 0.1), wall=wall, wall_reflectance=1.0)
     solution = jax.jit(solve, static_argnums=0)(LATTICES["26"], co, deposit, tolerance=1e-6)
     assert bool(solution.converged)
     assert float(jnp.sum(co.absorption * solution.phi)) == pytest.approx(1.0, rel=1e-4)
