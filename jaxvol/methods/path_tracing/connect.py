@@ -81,8 +81,13 @@ def equiangular_density(scene, segment: Segment, position, light_position):
     return pdf * (lights.num_lights(scene) / lights.num_lights(nearby_lights(scene)))
 
 
-def connect_equiangular(scene, settings, lanes, casts, ready, u) -> Shadow:
-    """One more vertex on the same flight, at a distance chosen equi-angularly towards a point of a light."""
+def connect_equiangular(scene, settings, proxy, lanes, casts, ready, u, corner) -> Shadow:
+    """One more vertex on the same flight, at a distance chosen equi-angularly towards a point of a light.
+
+    In a grid the contribution holds the density there but not yet the transmittance to it, which is tracked; `proxy`,
+    homogeneous media of the grids' mean densities, stands for the free flight's density in the weights, which any
+    function may that is the same on both sides.
+    """
     lit = nearby_lights(scene)
     ready = ready & ~lanes.starting & (lanes.num_vertices < settings.max_scatterings)
     target = lights.sample_light(lit, lanes.origin, u[1], u[2], u[3]).position
@@ -91,7 +96,9 @@ def connect_equiangular(scene, settings, lanes, casts, ready, u) -> Shadow:
     t, pdf = sampling.sample_equiangular(u[0], lanes.origin, lanes.direction, t0, t1, target)
     position = lanes.origin + t[:, None] * lanes.direction
     found = lights.sample_light(lit, position, u[1], u[2], u[3])
-    density, through, region = flights.homogeneous_pdf(scene.medium, spans, lanes.throughput, t)
+    density, through, region = flights.homogeneous_pdf(proxy, spans, lanes.throughput, t)
+    if settings.tracked:
+        through = flights.scattering_at(scene.medium, region, position, corner)
     cosine = sampling.dot(lanes.direction, found.direction)
     scattered = flights.phase_value(scene.medium, region, cosine)
     own = pdf * found.pdf

@@ -14,6 +14,7 @@ from jax import lax
 
 from jaxvol import ray_casting, segments
 from jaxvol.methods.path_tracing import sensors
+from jaxvol.methods.path_tracing.flight import mean_medium
 from jaxvol.methods.path_tracing.lanes import Casts, Lanes, Settings, flush, flush_host, idle, num_columns
 from jaxvol.methods.path_tracing.step import Work, step
 from jaxvol.ray_casting import EmbreeCaster
@@ -21,8 +22,8 @@ from jaxvol.types import Scene
 
 
 @partial(jax.jit, static_argnames=("settings",))
-def _jit_step(scene, sensor, settings, seed, lanes, casts, work):
-    lanes, work, ended = step(scene, sensor, settings, seed, lanes, casts, work)
+def _jit_step(scene, proxy, sensor, settings, seed, lanes, casts, work):
+    lanes, work, ended = step(scene, proxy, sensor, settings, seed, lanes, casts, work)
     return lanes, work, ended, jnp.any(lanes.alive | lanes.finished.valid)
 
 
@@ -77,9 +78,8 @@ def _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spa
         far = np.full(index.size, np.inf, np.float32)
         t, region = _cut(scene, medium_casters, origin[index], direction[index], far, max_spans)
         casts.path_spans[0][index], casts.path_spans[1][index] = t, region
-    recast = np.asarray(lanes.recast)
-    for number, shadow in enumerate(lanes.shadows):
-        index = np.flatnonzero(np.asarray(shadow.active) & recast)
+    for number, (shadow, recast) in enumerate(zip(lanes.shadows, lanes.recast_shadows, strict=True)):
+        index = np.flatnonzero(np.asarray(shadow.active) & np.asarray(recast))
         if not index.size:
             continue
         origin, direction, distance = (np.asarray(x)[index] for x in (shadow.origin, shadow.direction, shadow.distance))
@@ -133,14 +133,17 @@ def run(
     items = num_pixels * num_samples
     work = Work(jnp.uint32(0), jnp.uint32(items), jnp.uint32(first_sample), jnp.int32(first_pixel), num_pixels)
     seed = jnp.uint32(seed)
+    proxy = mean_medium(scene.medium) if settings.equiangular else None
     uses_embree = isinstance(caster, EmbreeCaster) or any(isinstance(c, EmbreeCaster) for c in medium_casters)
     if not uses_embree:
-        return np.asarray(_device_loop(scene, sensor, settings, seed, lanes, work, film, caster, medium_casters, max_spans))
+        return np.asarray(
+            _device_loop(scene, proxy, sensor, settings, seed, lanes, work, film, caster, medium_casters, max_spans)
+        )
     casts = _host_casts(num_lanes, num_shadows, settings, max_spans)
     count = 0
     busy = True
     while busy:
-        lanes, work, ended, busy = _jit_step(scene, sensor, settings, seed, lanes, casts, work)
+        lanes, work, ended, busy = _jit_step(scene, proxy, sensor, settings, seed, lanes, casts, work)
         flush_host(film, ended.sums, ended.finished, num_pixels, first_pixel)
         casts = _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spans)
         count += 1
@@ -150,11 +153,11 @@ def run(
 
 
 @partial(jax.jit, static_argnames=("settings", "max_spans"), donate_argnames=("film",))
-def _device_loop(scene, sensor, settings, seed, lanes, work, film, caster, medium_casters, max_spans):
+def _device_loop(scene, proxy, sensor, settings, seed, lanes, work, film, caster, medium_casters, max_spans):
     def body(state):
         lanes, work, film, _ = state
         casts = cast_all(scene, caster, medium_casters, lanes, settings, max_spans)
-        lanes, work, ended = step(scene, sensor, settings, seed, lanes, casts, work)
+        lanes, work, ended = step(scene, proxy, sensor, settings, seed, lanes, casts, work)
         film = flush(film, ended.sums, ended.finished, work.num_pixels, work.first_pixel)
         return lanes, work, film, jnp.any(lanes.alive | lanes.finished.valid)
 

@@ -64,7 +64,7 @@ def plan(
 
     `max_scatterings` counts vertices of any kind; `roulette_from` is the number of vertices from which Russian roulette
     may end a path; `equiangular=None` uses equi-angular distances where lights stand in or near a
-    homogeneous medium. Raises ValueError for a refractive index other than 1 and for counts out of range.
+    medium. Raises ValueError for a refractive index other than 1 and for counts out of range.
     """
     if max_scatterings < 0:
         raise ValueError(f"max_scatterings: {max_scatterings} is not allowed, must be >= 0")
@@ -79,10 +79,10 @@ def plan(
     tracked = medium is not None and not media.is_homogeneous(medium)
     lit = lights.num_lights(scene) > 0
     near = medium is not None and _light_near(scene, medium)
-    use_equiangular = near and not tracked if equiangular is None else equiangular
+    use_equiangular = near if equiangular is None else equiangular
     placed = any(x is not None for x in (scene.point_lights, scene.spot_lights, scene.area_lights))
-    if use_equiangular and (tracked or medium is None or not placed):
-        raise ValueError("equiangular: true needs a homogeneous medium and a point, spot or area light")
+    if use_equiangular and (medium is None or not placed):
+        raise ValueError("equiangular: true needs a medium and a point, spot or area light")
     settings = Settings(
         max_scatterings=min(max_scatterings, 1_000_000) if lit else 0,
         roulette_from=roulette_from,
@@ -138,7 +138,7 @@ def _skipped(scene, medium, drop_medium, settings, lit):
     if medium is not None and not settings.bounded:
         reasons.append("the medium fills its box: one span a ray, no boundary crossings")
     if medium is not None and not settings.equiangular:
-        reasons.append("no equi-angular sampling: no light near a homogeneous medium")
+        reasons.append("no equi-angular sampling: no light in or near the medium")
     return tuple(reasons)
 
 

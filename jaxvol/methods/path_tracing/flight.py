@@ -195,6 +195,29 @@ def sample_phase(medium: Medium, region: Int[Array, "n"], direction: Float[Array
     return out, pdf
 
 
+def scattering_at(medium: Medium, region: Int[Array, "n"], position: Float[Array, "n 3"], corner) -> Float[Array, "n 3"]:
+    """sigma_s times density at positions, by one stochastic corner each: unbiased."""
+    total = jnp.zeros((*region.shape, 3), jnp.float32)
+    for number, one in enumerate(regions(medium)):
+        value = media.density_stochastic(one, position, corner)[:, None] * one.sigma_s
+        total = jnp.where((region == number)[:, None], value, total)
+    return total
+
+
+def mean_medium(medium: Medium) -> Medium:
+    """The same media without their grids: sigma times the mean density. Eager; a stand-in where weights need a pdf."""
+
+    def flat(one):
+        if one.density is None:
+            return one
+        mean = jnp.mean(one.density)
+        changed = {"density": None, "majorants": None, "sigma_s": one.sigma_s * mean, "sigma_a": one.sigma_a * mean}
+        return Medium(**({f: getattr(one, f) for f in Medium.__dataclass_fields__} | changed))
+
+    inclusions = tuple(flat(one) for one in medium.inclusions)
+    return Medium(**({f: getattr(flat(medium), f) for f in Medium.__dataclass_fields__} | {"inclusions": inclusions}))
+
+
 def span_start(spans: Spans) -> Float[Array, "n"]:
     """Where tracking starts."""
     return spans[0][:, 0]

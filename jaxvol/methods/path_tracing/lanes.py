@@ -76,16 +76,18 @@ class Finished(eqx.Module):
     valid: Bool[Array, "n"]
 
 
-ON_SHADOW, ON_PATH, ARRIVED = range(3)
+# Stages of a tracked flight: the shadow ray of the last vertex; the path's ray up to the equi-angular vertex, and that
+# vertex' shadow ray; the path's own flight; and its end.
+ON_SHADOW, ON_APPROACH, ON_SECOND_SHADOW, ON_PATH, ARRIVED = range(5)
 
 
 class Flight(eqx.Module):
-    """Progress of a tracked flight through density grids: first along the shadow ray, then along the path."""
+    """Progress of a lane through density grids, one ray after the other."""
 
-    stage: Int[Array, "n"]  # ON_SHADOW, ON_PATH or ARRIVED (the path's flight has ended)
+    stage: Int[Array, "n"]
     t: Float[Array, "n"]  # negative before the first step
     span: Int[Array, "n"]
-    ratio: Float[Array, "n 3"]  # shadow: transmittance so far; path: null-collision probabilities over the hero's
+    ratio: Float[Array, "n 3"]  # to lights: transmittance so far; path: null-collision probabilities over the hero's
     hero: Int[Array, "n"]  # channel that decides the collisions of the path's flight
     collided: Bool[Array, "n"]
     region: Int[Array, "n"]  # medium of the collision
@@ -122,7 +124,8 @@ class Lanes(eqx.Module):
     finished: Finished
     flight: Flight | None
     segment: Segment | None  # only with equi-angular sampling
-    recast: Bool[Array, "n"]  # the rays are new and want casting
+    recast: Bool[Array, "n"]  # the path's ray is new and wants casting
+    recast_shadows: tuple[Bool[Array, "n"], ...]  # likewise those of each shadow slot
 
 
 def possible_groups(*, has_mesh: bool, has_medium: bool) -> tuple[int, ...]:
@@ -160,6 +163,7 @@ def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: 
         flight=Flight(i(), f(n), i(), f(n, 3), i(), b(), i(), u()) if tracked else None,
         segment=Segment(f(n, 3), x(), f(n), f(n), f(n)) if equiangular else None,
         recast=b(),
+        recast_shadows=tuple(b() for _ in range(num_shadows)),
     )
 
 

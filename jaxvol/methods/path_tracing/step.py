@@ -26,7 +26,7 @@ from jaxvol.methods.path_tracing.lanes import (
     add_to_group,
     group_after,
 )
-from jaxvol.methods.path_tracing.tracking import path_spans, shadow_spans, take_off, track
+from jaxvol.methods.path_tracing.tracking import board, path_spans, shadow_spans, take_off, track
 from jaxvol.types import Scene
 
 _STREAM = sampling.stream("path_tracing")
@@ -50,9 +50,17 @@ class Ended(eqx.Module):
 
 
 def step(
-    scene: Scene, sensor: sensors.Sensor, settings: Settings, seed, lanes: Lanes, casts: Casts, work: Work
+    scene: Scene, proxy, sensor: sensors.Sensor, settings: Settings, seed, lanes: Lanes, casts: Casts, work: Work
 ) -> tuple[Lanes, Work, Ended]:
-    """Advance every lane by one event (or by a few tentative collisions towards it)."""
+    """Advance every lane by one event (or by a few tentative collisions towards it).
+
+    `proxy` is the scene's medium without grids (`flight.mean_medium`); None where equi-angular sampling is off.
+    """
+    if settings.tracked and settings.equiangular:
+        fresh = lanes.recast & lanes.alive & ~lanes.starting
+        lanes = _connect_ahead(scene, proxy, settings, seed, lanes, casts, fresh)
+        # What was cast in this slot belongs to an older ray; the new one is cast after this step.
+        casts = eqx.tree_at(lambda c: c.blocked, casts, (casts.blocked[0], casts.blocked[1] & ~fresh))
     if settings.tracked:
         lanes, through = track(scene, settings, seed, lanes, casts)
     else:
@@ -75,9 +83,21 @@ def step(
     ready = lanes.alive & ~pending
     if settings.tracked:
         ready = ready & ((lanes.flight.stage == ARRIVED) | lanes.starting)
-    lanes, dead = _event(scene, sensor, settings, seed, lanes, casts, ready)
+    lanes, dead = _event(scene, proxy, sensor, settings, seed, lanes, casts, ready)
     lanes, work = _refill(sensor, settings, seed, lanes, dead, work)
     return lanes, work, ended
+
+
+def _connect_ahead(scene, proxy, settings, seed, lanes, casts, fresh):
+    """In grids: choose the equi-angular vertex of every new ray before flying along it."""
+    draw = lambda block: sampling.uniforms(seed, _STREAM, lanes.pixel, lanes.event * 8 + block, lanes.sample)  # noqa: E731
+    extra = connect_equiangular(scene, settings, proxy, lanes, casts, fresh, draw(5), draw(6)[:3])
+    lanes = eqx.tree_at(
+        lambda x: (x.shadows, x.recast_shadows),
+        lanes,
+        ((lanes.shadows[0], _replace(lanes.shadows[1], extra, fresh)), (lanes.recast_shadows[0], fresh)),
+    )
+    return board(lanes, fresh)
 
 
 def _closed_form_transmittance(scene, settings, lanes, casts):
@@ -102,7 +122,7 @@ def _resolve_shadows(lanes, casts, through):
     return eqx.tree_at(lambda x: (x.sums, x.shadows), lanes, (sums, tuple(shadows)), is_leaf=lambda x: x is None)
 
 
-def _arrive(scene, settings, lanes, casts, ready, u) -> Arrival:
+def _arrive(scene, proxy, settings, lanes, casts, ready, u) -> Arrival:
     ready = ready & ~lanes.starting
     n = ready.shape[0]
     collided = jnp.zeros(n, bool)
@@ -117,6 +137,8 @@ def _arrive(scene, settings, lanes, casts, ready, u) -> Arrival:
         mean = jnp.maximum(jnp.sum(share * flight.ratio, axis=-1), 1e-37)
         albedo = flights.albedo(scene.medium, region)
         weight = jnp.where(collided[:, None], albedo, 1.0) * flight.ratio / mean[:, None]
+        if settings.equiangular:
+            density = flights.homogeneous_pdf(proxy, path_spans(scene, settings, lanes, casts), lanes.throughput, t)[0]
     elif scene.medium is not None:
         spans = path_spans(scene, settings, lanes, casts)
         t_flight, collided, region, weight, density = flights.sample_homogeneous(
@@ -156,11 +178,11 @@ def _emission(scene, settings, lanes, casts, arrival, throughput):
     return throughput * radiance * mis[:, None]
 
 
-def _event(scene, sensor, settings, seed, lanes, casts, ready):
+def _event(scene, proxy, sensor, settings, seed, lanes, casts, ready):
     """What happens where flights end: light is met, a vertex is connected to a light, and the path scatters or ends."""
     draw = lambda block: sampling.uniforms(seed, _STREAM, lanes.pixel, lanes.event * 8 + block, lanes.sample)  # noqa: E731
     flight_u, light_u, scatter_u = draw(0), draw(1), draw(2)
-    arrival = _arrive(scene, settings, lanes, casts, ready, flight_u)
+    arrival = _arrive(scene, proxy, settings, lanes, casts, ready, flight_u)
     throughput = lanes.throughput * arrival.weight
     count = lanes.num_vertices
     # `group` of light that joins the path as it stands; the last vertex' type rides in `lanes.last_volume`.
@@ -191,8 +213,8 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
             group_after(count, first_volume, last_volume),
         )
         shadows = (_replace(shadows[0], shadow, ready), *shadows[1:])
-    if settings.equiangular:
-        extra = connect_equiangular(scene, settings, lanes, casts, ready, draw(3))
+    if settings.equiangular and not settings.tracked:
+        extra = connect_equiangular(scene, settings, proxy, lanes, casts, ready, draw(3), None)
         shadows = (shadows[0], _replace(shadows[1], extra, ready))
 
     direction, weight, pdf = _scatter(scene, lanes, arrival, surface, scatter_u)
@@ -211,6 +233,9 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
     ended = ready & ~lanes.starting & ~go
     pick = lambda new, old: jnp.where(go[:, None] if new.ndim == 2 else go, new, old)  # noqa: E731
     before = lanes
+    recast_shadows = lanes.recast_shadows
+    if shadows:
+        recast_shadows = (ready, *(recast_shadows[1:] if settings.tracked else [ready] * (len(shadows) - 1)))
     lanes = eqx.tree_at(
         lambda x: (
             x.sums,
@@ -225,6 +250,7 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
             x.event,
             x.starting,
             x.recast,
+            x.recast_shadows,
         ),
         lanes,
         (
@@ -240,6 +266,7 @@ def _event(scene, sensor, settings, seed, lanes, casts, ready):
             lanes.event + ready.astype(jnp.uint32),
             lanes.starting & ~ready,
             ready,
+            recast_shadows,
         ),
     )
     if settings.equiangular:
@@ -320,6 +347,7 @@ def _refill(sensor, settings, seed, lanes, ended, work):
         flight=lanes.flight,
         segment=lanes.segment,
         recast=lanes.recast | start,
+        recast_shadows=lanes.recast_shadows,
     )
     if settings.tracked:
         lanes = take_off(lanes, start, u3)
