@@ -2,7 +2,9 @@
 
 Infinite medium, sigma_t 1, albedo .9, g 0, point light of power 1 at distance 1 from the middle of a ray of length 6; light
 that scattered at least twice. Exact: 2.27358e-3 from the Fourier solution, here again from Case's solution by quadrature.
-Usage: python experiments/instant_bias_table.py [--sets 512] [--only MODE ...].
+The column "paired" is the difference from 4 steps with the same lights, which takes the lights' own noise out. With --scene
+plume or room the approximation modes there, as paired differences of the picture's mean from the default.
+Usage: python experiments/instant_bias_table.py [--sets 512] [--only MODE ...] [--scene infinite|plume|room].
 """
 
 import argparse
@@ -10,14 +12,15 @@ import time
 
 import jax.numpy as jnp
 import numpy as np
-from instant_common import figure, infinite, out_folder, square_camera, write_csv
+from instant_common import SCENES, figure, infinite, out_folder, square_camera, write_csv
 from scipy import integrate
 
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering.rendering import gather_rays, make_context
+from jaxvol.methods.instant_multiple_scattering.rendering import gather_rays, make_context, render_set
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import sizes as sizes_of
 
 LANES, PATHS = 64, 32
+REFERENCE = "4 steps, clamped end"
 MODES = {
     "unclamped": {"mean_free_paths": None},
     "clamped only": {"num_levels": 0},
@@ -70,26 +73,84 @@ def run(options, sets):
     return np.array(values, np.float64)
 
 
+APPROXIMATIONS = {
+    "plume": {
+        "clamped only": {"num_levels": 0},
+        "2 steps": {"num_levels": 2},
+        "local transmittance": {"transmittance": "local"},
+        "no direct light at the vertex (the paper)": {"direct_at_vertex": False},
+    },
+    "room": {
+        "clamped only": {"num_levels": 0},
+        "no visibility of new vertices": {"visibility": "none"},
+        "no direct light at the vertex (the paper)": {"direct_at_vertex": False},
+    },
+}
+
+
+def approximations(name, sets):
+    """Paired differences of every mode's picture mean from the default's, in shares of it, with standard errors."""
+    scene, camera = SCENES[name](), square_camera(12)
+    means = {}
+    for mode, options in {"default": {}, **APPROXIMATIONS[name]}.items():
+        plan = ims.plan(scene, camera, num_paths=256, tile=144, **options)
+        sizes = {}
+        totals = [sum(render_set(scene, camera, plan, seed=50 + k, sizes=sizes)[0].values()) for k in range(sets)]
+        means[mode] = np.array([t.mean(dtype=np.float64) for t in totals])
+    rows = []
+    for mode in APPROXIMATIONS[name]:
+        difference = means[mode] - means["default"]
+        scale = means["default"].mean()
+        rows.append([mode, difference.mean() / scale, difference.std(ddof=1) / np.sqrt(sets) / scale])
+        print(f"{name} {mode:45s} {rows[-1][1]:+.4f} +- {rows[-1][2]:.4f}", flush=True)
+    write_csv(out_folder() / f"bias_table_{name}.csv", ["mode", "difference", "se"], rows)
+    with figure(out_folder() / f"bias_table_{name}.png", size=(7, 2.5)) as axes:
+        axes.barh([r[0] for r in rows], [100 * r[1] for r in rows], xerr=[100 * r[2] for r in rows])
+        axes.set_xlabel(f"{name}: difference of the mean from the default, %")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sets", type=int, default=512)
     parser.add_argument("--only", nargs="*", default=list(MODES))
+    parser.add_argument("--scene", choices=["infinite", *APPROXIMATIONS], default="infinite")
     arguments = parser.parse_args()
+    if arguments.scene != "infinite":
+        approximations(arguments.scene, arguments.sets)
+        return
     exact = exact_radiance()
     print(f"exact {exact:.6g}")
     rows = []
+    base = run(MODES[REFERENCE], arguments.sets).mean(axis=1)
     for name in arguments.only:
         start = time.process_time()
         values = run(MODES[name], arguments.sets)
         means = values.mean(axis=1)
         error = means.std(ddof=1) / np.sqrt(len(means))
-        rows.append([name, means.mean() / exact - 1, error / exact, values.std() / exact, time.process_time() - start])
-        print(f"{name:52s} bias {rows[-1][1]:+.4f} +- {rows[-1][2]:.4f}  std of a set {rows[-1][3]:.3f}  "
-              f"cpu {rows[-1][4]:.1f} s", flush=True)
-        write_csv(out_folder() / "bias_table.csv", ["mode", "bias", "se", "std_per_set", "cpu_s"], rows)
+        paired = (means - base) / exact
+        rows.append(
+            [
+                name,
+                means.mean() / exact - 1,
+                error / exact,
+                paired.mean(),
+                paired.std(ddof=1) / np.sqrt(len(means)),
+                values.std() / exact,
+                time.process_time() - start,
+            ]
+        )
+        print(
+            f"{name:52s} bias {rows[-1][1]:+.4f} +- {rows[-1][2]:.4f}  paired {rows[-1][3]:+.4f} +- {rows[-1][4]:.4f}  "
+            f"std of a set {rows[-1][5]:.3f}  cpu {rows[-1][6]:.1f} s",
+            flush=True,
+        )
+        header = ["mode", "bias", "se", "paired", "paired_se", "std_per_set", "cpu_s"]
+        write_csv(out_folder() / "bias_table.csv", header, rows)
     with figure(out_folder() / "bias_table.png", size=(8, 4)) as axes:
         y = np.arange(len(rows))[::-1]
-        axes.errorbar([100 * r[1] for r in rows], y, xerr=[100 * r[2] for r in rows], fmt="o")
+        axes.errorbar([100 * r[1] for r in rows], y, xerr=[100 * r[2] for r in rows], fmt="o", label="against the exact value")
+        axes.errorbar([100 * r[3] for r in rows], y - 0.25, xerr=[100 * r[4] for r in rows], fmt="s", label="paired with 4 steps")
+        axes.legend(fontsize=7)
         axes.axvline(0, color="k", lw=0.5)
         axes.set_yticks(y, [r[0] for r in rows], fontsize=7)
         axes.set_xlabel("bias of the mean, % (bars: one standard error)")

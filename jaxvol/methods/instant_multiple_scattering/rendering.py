@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt
@@ -17,6 +18,7 @@ from jaxvol.methods.instant_multiple_scattering.virtual_lights import LightSet
 from jaxvol.types import Camera, Estimate, Scene
 
 _PIXEL = sampling.stream("instant_multiple_scattering.pixel")
+_STRATA = 4  # of a pixel, each way
 _TERMS = ("surface", "volume", "multiple")
 NAMES = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in _TERMS)
 
@@ -154,9 +156,10 @@ def _evaluate(context, camera, index, result):
         chosen = index[begin : begin + size]
         lanes = np.full(size, chosen[-1], np.uint32)
         lanes[: len(chosen)] = chosen
-        values = gather_rays(context, *eye_rays(context, camera, jnp.asarray(lanes)))
+        rays, weight = eye_rays(context, camera, jnp.asarray(lanes))
+        values = gather_rays(context, *rays)
         for name in NAMES:
-            result[name][chosen] = np.asarray(values[name])[: len(chosen)]
+            result[name][chosen] = (np.asarray(values[name]) * weight)[: len(chosen)]
 
 
 def _from_low_resolution(context, camera, result, counts):
@@ -174,18 +177,35 @@ def _from_low_resolution(context, camera, result, counts):
             coarse[name][begin : begin + plan.tile] = np.asarray(values[name])
     steps = max(plan.eye_steps // 2, 1)
     low_guides = upsampling.guides(context.scene, *rays[:4], num_steps=steps)
-    centers = eye_rays(_without_jitter(context), camera, jnp.arange(number, dtype=jnp.uint32))
+    centers, _ = eye_rays(_without_jitter(context), camera, jnp.arange(number, dtype=jnp.uint32))
     full_guides = upsampling.guides(context.scene, *centers[:4], num_steps=steps)
+    full_guides = _with_mean_source(context, camera, full_guides)
     built, weight = upsampling.reconstruct(
         coarse, low_guides, full_guides, height=camera.height, width=camera.width, factor=factor
     )
     for name in NAMES:
         result[name][:] = np.asarray(built[name])
-    seen = np.asarray(full_guides.inside | full_guides.hits)
+    seen = np.asarray(jnp.any(full_guides.source > 0, axis=-1) | full_guides.hits)
     again = np.flatnonzero((np.asarray(weight) < plan.refine_below) & seen).astype(np.uint32)
     if len(again):
-        _evaluate(_without_jitter(context), camera, again, result)
+        _evaluate(context, camera, again, result)
     return result, {**counts, "num_refined": len(again), "num_evaluated": len(again) + shape[0]}
+
+
+def _with_mean_source(context, camera, guides):
+    """The factor that puts transmittance back, averaged over the pixel when pixels are jittered and nothing occludes."""
+    if not context.plan.jitter or context.scene.mesh is not None:
+        return guides
+    strata = _STRATA if context.scene.medium.density is None else _STRATA // 2
+    index = jnp.arange(guides.end.shape[0], dtype=jnp.uint32)
+    corner = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
+    total = jnp.zeros_like(guides.source)
+    for k in range(strata * strata):
+        inside = (jnp.asarray([k % strata, k // strata]) + 0.5) / strata
+        rays = cast(context, camera, corner + inside, index)
+        steps = max(context.plan.eye_steps // 2, 1)
+        total = total + upsampling.guides(context.scene, *rays[:4], num_steps=steps).source
+    return dataclasses.replace(guides, source=total / (strata * strata))
 
 
 def _without_jitter(context):
@@ -200,10 +220,6 @@ def _block_rays(context, camera, rows, columns, factor):
     return cast(context, camera, xy, index)
 
 
-def _jittered(context, index):
-    return jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
-
-
 def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"]) -> tuple:
     """Origins, directions, first hits (t, face) of the eye rays through `xy`, and the given numbers."""
     rays = pinhole.generate_rays(camera, xy)
@@ -215,12 +231,43 @@ def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[
     return rays.origin, rays.direction, t, face, index
 
 
-def eye_rays(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple:
-    """Origins, directions, first hits (t, face) of the eye rays through pixels, and the pixels' numbers."""
+def eye_rays(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple[tuple, np.ndarray]:
+    """What `gather_rays` takes for rays through pixels, and the weight [n, 1] of their values.
+
+    Without surfaces a jittered ray is one of 16 strata of the pixel, chosen in proportion to 1 - exp(-length * mean
+    extinction) inside the medium: a pixel at the medium's edge is then not hit or missed by chance.
+    """
     index = jnp.asarray(index)
     xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
-    inside = _jittered(context, index) if context.plan.jitter else jnp.float32(0.5)
-    return cast(context, camera, xy + inside, index)
+    if not context.plan.jitter:
+        return cast(context, camera, xy + 0.5, index), np.float32(1.0)
+    if context.scene.mesh is not None or context.scene.medium is None:
+        inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
+        return cast(context, camera, xy + inside, index), np.float32(1.0)
+    chosen, weight = choose_in_pixel(context.scene, camera, xy, index, context.seed)
+    return cast(context, camera, chosen, index), np.asarray(weight)[:, None]
+
+
+@jax.jit
+def choose_in_pixel(
+    scene: Scene, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"], seed: UInt[Array, ""]
+) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
+    """A place in each pixel (its upper left corner is `xy`) by how much medium lies behind it, and 1 / (16 p)."""
+    u = sampling.uniforms(seed, _PIXEL, index, 0)
+    strata = jnp.arange(_STRATA * _STRATA)
+    corner = jnp.stack([strata % _STRATA, strata // _STRATA], axis=-1)
+    inside = (corner + jnp.stack(u[:2], axis=-1)[:, None]) / _STRATA
+    places = xy[:, None] + inside
+    rays = pinhole.generate_rays(camera, places)
+    t0, t1 = media.box_interval(scene.medium.bounds, rays.origin, rays.direction)
+    density = 1.0 if scene.medium.density is None else jnp.mean(scene.medium.density)
+    share = -jnp.expm1(-(t1 - t0) * density * jnp.mean(media.sigma_t(scene.medium)))
+    cumulative = jnp.cumsum(share, axis=1)
+    total = cumulative[:, -1]
+    pick = jnp.minimum(jnp.sum(cumulative < (u[2] * total)[:, None], axis=1), strata.size - 1)
+    lanes = jnp.arange(index.shape[0])
+    weight = jnp.where(total > 0, total / strata.size / jnp.maximum(share[lanes, pick], 1e-30), 0.0)
+    return places[lanes, pick], weight
 
 
 def render(
