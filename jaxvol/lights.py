@@ -259,7 +259,7 @@ def sample_light(
         elif kind == "spot":
             spots = scene.spot_lights
             found = _point_like(
-                position, spots.position[index], spots.intensity[index], lambda w, i=index: spot_falloff(spots, i, w)
+                position, spots.position[index], spots.intensity[index], lambda w, s=spots, i=index: spot_falloff(s, i, w)
             )
         elif kind == "directional":
             suns = scene.directional_lights

@@ -53,7 +53,7 @@ def _integer_or_real_power(base, exponent):
 def evaluate(
     surface: Surface, normal: Float[Array, "*b 3"], incoming: Float[Array, "*b 3"], outgoing: Float[Array, "*b 3"]
 ) -> Float[Array, "*b 3"]:
-    """BSDF value, 1/sr, WITHOUT the cosine: albedo / pi + specular (n+2)/(2 pi) cos^n(mirror, outgoing); 0 below the surface."""
+    """BSDF without the cosine, 1/sr: albedo / pi + specular (n+2)/(2 pi) cos^n(mirror, outgoing); 0 below the surface."""
     n = facing_normal(normal, incoming)
     value = surface.albedo * _INV_PI
     if surface.specular is not None:

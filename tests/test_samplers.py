@@ -242,7 +242,7 @@ def test_equiangular_and_exponential_samplers():
     assert stats.kstest(np.asarray(t), cdf).pvalue > 1e-3
     for sigma in (0.0, 1e-6, 0.7, 50.0):
         t = np.asarray(sampling.sample_truncated_exponential(u, jnp.float32(sigma), jnp.float32(2.0)), np.float64)
-        exact = (lambda x: x / 2) if sigma == 0 else (lambda x: np.expm1(-sigma * x) / np.expm1(-sigma * 2.0))
+        exact = (lambda x: x / 2) if sigma == 0 else (lambda x, s=sigma: np.expm1(-s * x) / np.expm1(-s * 2.0))
         assert stats.kstest(t, exact).pvalue > 1e-3
         grid = (np.arange(20000) + 0.5) / 10000
         total = np.mean(sampling.sample_truncated_exponential_pdf(jnp.asarray(grid, jnp.float32), sigma, 2.0)) * 2
