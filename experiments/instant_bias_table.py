@@ -149,7 +149,9 @@ def main():
     with figure(out_folder() / "bias_table.png", size=(8, 4)) as axes:
         y = np.arange(len(rows))[::-1]
         axes.errorbar([100 * r[1] for r in rows], y, xerr=[100 * r[2] for r in rows], fmt="o", label="against the exact value")
-        axes.errorbar([100 * r[3] for r in rows], y - 0.25, xerr=[100 * r[4] for r in rows], fmt="s", label="paired with 4 steps")
+        axes.errorbar(
+            [100 * r[3] for r in rows], y - 0.25, xerr=[100 * r[4] for r in rows], fmt="s", label="paired with 4 steps"
+        )
         axes.legend(fontsize=7)
         axes.axvline(0, color="k", lw=0.5)
         axes.set_yticks(y, [r[0] for r in rows], fontsize=7)

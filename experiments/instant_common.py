@@ -111,7 +111,9 @@ def plume(n: int = 32, *, g: float = 0.5, time: float = 0.0) -> Scene:
 def box(low, high, color):
     """Vertices, faces and albedos of a closed box."""
     low, high = np.array(low, float), np.array(high, float)
-    corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    corners = np.array(
+        [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    )
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     return corners, faces, np.tile(color, (len(faces), 1))

@@ -1,7 +1,8 @@
 """Equal-time comparison with Mitsuba 3's volpath: CPU seconds against relMSE (CSV and a figure).
 
-Both render the whole picture (single scattering included, ours from 12 stratified points per eye ray), on one core. relMSE against a reference R with its own noise removed: mean((I - A)(I - B)) / mean(R^2 + ...)
-with two independent halves A, B of the reference. Needs mitsuba (extra "peer") and, for llvm_ad_rgb, DRJIT_LIBLLVM_PATH.
+Both render the whole picture (single scattering included, ours from 12 stratified points per eye ray), on one core.
+relMSE against a reference R with its own noise removed: mean((I - A)(I - B) / (R^2 + 0.01 mean(R)^2)) with two
+independent halves A, B of the reference. Needs mitsuba (extra "peer") and, for llvm_ad_rgb, DRJIT_LIBLLVM_PATH.
 Usage: taskset -c 0 python experiments/instant_equal_time.py cube|cube_g|plume [--size 64] [--variant llvm_ad_rgb].
 """
 
@@ -160,18 +161,34 @@ def main():
         render(spp, 1)
         results = [render(spp, 10 + k) for k in range(arguments.repeats)]
         errors = [relmse(image, *halves) for image, _ in results]
-        rows.append(["mitsuba volpath", spp, np.median([s for _, s in results]), np.mean(errors), results[0][0].mean() / kept[0].mean() - 1])
+        rows.append(
+            [
+                "mitsuba volpath",
+                spp,
+                np.median([s for _, s in results]),
+                np.mean(errors),
+                results[0][0].mean() / kept[0].mean() - 1,
+            ]
+        )
         print(*rows[-1], flush=True)
     for label, options in OURS.items():
         for number in PATHS:
             plan = ims.plan(
-                scene, camera, num_paths=number, num_levels=arguments.levels, mean_free_paths=arguments.mean_free_paths, tile=4096, **options
+                scene,
+                camera,
+                num_paths=number,
+                num_levels=arguments.levels,
+                mean_free_paths=arguments.mean_free_paths,
+                tile=4096,
+                **options,
             )
             ours(scene, camera, plan, 1)
             results = [ours(scene, camera, plan, 10 + k) for k in range(arguments.repeats)]
             errors = [relmse(image, *halves) for image, _, _ in results]
             seconds = np.median([s for _, s, _ in results])
-            rows.append([label, number, seconds, np.mean(errors), np.mean([i.mean() for i, _, _ in results]) / kept[0].mean() - 1])
+            rows.append(
+                [label, number, seconds, np.mean(errors), np.mean([i.mean() for i, _, _ in results]) / kept[0].mean() - 1]
+            )
             print(*rows[-1], results[-1][2], flush=True)
         kept.append(results[0][0])
     folder = out_folder()
@@ -186,7 +203,13 @@ def main():
     shape = (arguments.size, arguments.size, 3)
     scale = 0.7 / np.percentile(kept[0], 99)
     names = ["reference", *OURS]
-    pictures(folder / f"equal_time_{arguments.scene}_pictures.png", [k.reshape(shape) for k in kept], columns=3, scale=scale, titles=names)
+    pictures(
+        folder / f"equal_time_{arguments.scene}_pictures.png",
+        [k.reshape(shape) for k in kept],
+        columns=3,
+        scale=scale,
+        titles=names,
+    )
 
 
 if __name__ == "__main__":

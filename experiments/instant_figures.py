@@ -161,7 +161,10 @@ def fig6(size, samples):
     lamps = PointLights(position=floats([-40, 0, 12], [0, 0, 12], [40, 0, 12]), intensity=floats(*[[300.0] * 3] * 3))
     scene = Scene(mesh=mesh, medium=medium, point_lights=lamps)
     camera = Camera(
-        world_from_camera=pinhole.look_at([-80, 2, 8], [0, 0, 10], [0, 0, 1]), fov_y=jnp.float32(0.9), height=size * 9 // 16, width=size
+        world_from_camera=pinhole.look_at([-80, 2, 8], [0, 0, 10], [0, 0, 1]),
+        fov_y=jnp.float32(0.9),
+        height=size * 9 // 16,
+        width=size,
     )
     rows, shown = [], []
     for name, options in {"full resolution": {}, "1/64 of the pixels": {"upsample": 8, "jitter": False}}.items():
@@ -186,7 +189,9 @@ def fig7(size, samples):
             error = metrics.relmse(picture, reference, variance=variance)
             rows.append([name, counts["num_lights"], seconds, error, metrics.bias(picture, reference)])
             difference = 2 * (picture - reference)
-            gap = np.stack([np.maximum(difference, 0).mean(-1), np.maximum(-difference, 0).mean(-1), 0 * difference[..., 0]], -1)
+            gap = np.stack(
+                [np.maximum(difference, 0).mean(-1), np.maximum(-difference, 0).mean(-1), 0 * difference[..., 0]], -1
+            )
             shown += [picture, gap]
             titles += [f"{name}, {counts['num_lights']} lights", "2 x difference (green: too dark)"]
             scales += [scale, scale]

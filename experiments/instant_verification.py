@@ -7,8 +7,8 @@ with surfaces in it. Usage: python experiments/instant_verification.py [SCENE ..
 import argparse
 
 import numpy as np
-
 from instant_common import SCENES, figure, out_folder, square_camera, write_csv
+
 from jaxvol import layers
 from jaxvol.methods import instant_multiple_scattering as ims
 from jaxvol.methods import path_tracing
@@ -42,8 +42,11 @@ def verify(name, *, paths, sets, samples, size, options):
         difference = mean / exact.mean() - 1
         z = (mean - exact.mean()) / np.hypot(error, reference_error)
         rows.append([name, layer, mean, error / mean, exact.mean(), reference_error / exact.mean(), difference, z])
-        print(f"{name:8s} {layer:22s} {mean:.5g} +- {error / mean:.2%}  reference {exact.mean():.5g} "
-              f"+- {reference_error / exact.mean():.2%}  difference {difference:+.2%}  z {z:+.1f}", flush=True)
+        print(
+            f"{name:8s} {layer:22s} {mean:.5g} +- {error / mean:.2%}  reference {exact.mean():.5g} "
+            f"+- {reference_error / exact.mean():.2%}  difference {difference:+.2%}  z {z:+.1f}",
+            flush=True,
+        )
     return rows
 
 
@@ -59,7 +62,9 @@ def main():
     rows = []
     for name in arguments.scenes:
         options = {"num_levels": arguments.levels}
-        rows += verify(name, paths=arguments.paths, sets=arguments.sets, samples=arguments.samples, size=arguments.size, options=options)
+        rows += verify(
+            name, paths=arguments.paths, sets=arguments.sets, samples=arguments.samples, size=arguments.size, options=options
+        )
         header = ["scene", "layer", "mean", "relative_se", "reference", "reference_se", "difference", "z"]
         write_csv(out_folder() / f"verification_{'_'.join(arguments.scenes)}.csv", header, rows)
     with figure(out_folder() / f"verification_{'_'.join(arguments.scenes)}.png") as axes:

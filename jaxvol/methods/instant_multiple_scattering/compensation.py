@@ -44,9 +44,7 @@ def weight(t: Float[Array, "*n"], d: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.maximum(1.0 - q * q, 0.0)
 
 
-def sample_distance_exponential(
-    u: Float[Array, "*n"], d: Float[Array, "*n"], sigma: Float[Array, "*n"]
-) -> Float[Array, "*n"]:
+def sample_distance_exponential(u: Float[Array, "*n"], d: Float[Array, "*n"], sigma: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The paper's t = -log(1 - u (1 - exp(-sigma d))) / sigma, in forms that hold for sigma -> 0."""
     return sampling.sample_truncated_exponential(u, sigma, d)
 
@@ -66,9 +64,7 @@ class Proposal(NamedTuple):
     gain: Float[Array, "n 3"]  # f_hat / p(direction): sigma_s in the medium, f_r cos / p on a surface
 
 
-def propose(
-    scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array, "n"], u3: Float[Array, "n"]
-) -> Proposal:
+def propose(scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array, "n"], u3: Float[Array, "n"]) -> Proposal:
     """A direction for the residual of each point, by the phase function or the BRDF."""
     backwards = -points.outgoing
     direction, gain, origin = backwards, points.scattering, points.position
@@ -193,9 +189,7 @@ def direct_light(
     if visible is not None:
         value = jnp.where(visible[:, None], value, 0.0)
     if scene.medium is not None:
-        column = receivers.column_between(
-            scene.medium, points.position, _end(points.position, sample), num_steps=num_steps
-        )
+        column = receivers.column_between(scene.medium, points.position, _end(points.position, sample), num_steps=num_steps)
         value = value * jnp.exp(-column[:, None] * media.sigma_t(scene.medium))
     return value
 

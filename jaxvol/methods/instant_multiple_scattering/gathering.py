@@ -62,9 +62,7 @@ def lobe(exponent: Float[Array, "*n"], cos_theta: Float[Array, "*n"]) -> Float[A
     return jnp.where(cos_theta > 0, jnp.exp(exponent * jnp.log(safe)), 0.0)
 
 
-def leaving(
-    light: Light, w: Vector, medium: Medium | None, *, isotropic: bool
-) -> tuple[Vector, Float[Array, "*n"] | float]:
+def leaving(light: Light, w: Vector, medium: Medium | None, *, isotropic: bool) -> tuple[Vector, Float[Array, "*n"] | float]:
     """What a light sends along the unit direction w, as RGB and a factor: radiance weight times emitter cosine."""
     if light.normal is None:
         return light.strength, phase_value(medium, pairs.dot(light.direction, w), isotropic=isotropic)
@@ -100,9 +98,7 @@ def scattered(points: Points, towards: Vector, medium: Medium | None, *, isotrop
     return tuple(jnp.where(points.on_surface, f * cosine, v) for f, v in zip(brdf, value, strict=True))
 
 
-def extinguish(
-    value: Vector, scale: Float[Array, "*n"], sigma_t: Vector, column: Float[Array, "*n"], *, grey: bool
-) -> Vector:
+def extinguish(value: Vector, scale: Float[Array, "*n"], sigma_t: Vector, column: Float[Array, "*n"], *, grey: bool) -> Vector:
     """value * scale * exp(-sigma_t column) per channel; one exponential when `grey`."""
     if grey:
         # The barrier keeps XLA from computing the factor again in each channel's loop.
@@ -205,9 +201,7 @@ def gather_segments(
 
 
 @partial(jax.jit, static_argnames=("grey", "isotropic"))
-def gather_points(
-    points: Points, lights: VirtualLights, medium: Medium, *, grey: bool, isotropic: bool
-) -> Float[Array, "n 3"]:
+def gather_points(points: Points, lights: VirtualLights, medium: Medium, *, grey: bool, isotropic: bool) -> Float[Array, "n 3"]:
     """Light of all lights scattered at points towards `outgoing`, homogeneous and unoccluded, clamped (min(1/r^2, b))."""
     position = pairs.components(points.position)
     sigma_t = pairs.components(media.sigma_t(medium))

@@ -37,8 +37,7 @@ def _ratios(old, new, start, position, direction, outgoing, surface, *, num_step
     densities = [media.density(m, position) for m in (old, new)]
     cosine = sampling.dot(direction, outgoing)
     before, after = (
-        d[:, None] * m.sigma_s * phase.evaluate(m, cosine)[:, None]
-        for d, m in zip(densities, (old, new), strict=True)
+        d[:, None] * m.sigma_s * phase.evaluate(m, cosine)[:, None] for d, m in zip(densities, (old, new), strict=True)
     )
     scattering = jnp.where(before > 0, after / jnp.where(before > 0, before, 1.0), 0.0)
     scattering = jnp.where(surface[:, None], 1.0, scattering)
@@ -59,9 +58,7 @@ def reweighted(old: Scene, new: Scene, vertices: Vertices, *, seed: int, num_ste
     surface = np.asarray(vertices.face) >= 0
     arrays = (start, vertices.position, vertices.direction, vertices.outgoing, surface)
     padded = [light_paths.padded(np.asarray(a)) for a in arrays]
-    tau, scattering, density = (
-        np.asarray(x)[:count] for x in _ratios(old.medium, new.medium, *padded, num_steps=num_steps)
-    )
+    tau, scattering, density = (np.asarray(x)[:count] for x in _ratios(old.medium, new.medium, *padded, num_steps=num_steps))
     depth = np.asarray(vertices.depth)
     change = np.array(tau, np.float64)
     for d in range(1, int(depth.max(initial=0)) + 1):

@@ -32,9 +32,7 @@ class Points(eqx.Module):
     surface: materials.Surface | None = None
 
 
-def column_between(
-    medium: Medium, a: Float[Array, "*n 3"], b: Float[Array, "*n 3"], *, num_steps: int
-) -> Float[Array, "*n"]:
+def column_between(medium: Medium, a: Float[Array, "*n 3"], b: Float[Array, "*n 3"], *, num_steps: int) -> Float[Array, "*n"]:
     """Integral of density from a to b: the midpoint rule over the part inside the bounds, closed form without a grid."""
     delta = b - a
     length = jnp.sqrt(jnp.maximum(sampling.dot(delta, delta), 1e-30))

@@ -27,9 +27,7 @@ def trace_lights(
     scene: Scene, caster: ray_casting.Caster, plan: Plan, *, seed: int, sizes: dict[str, int] | None = None
 ) -> tuple[LightSet, dict[str, int]]:
     """One set of virtual lights and the counts of its paths; for `sizes` see `virtual_lights`."""
-    vertices, counts = light_paths.trace(
-        scene, caster, seed=seed, paths=np.arange(plan.num_paths), max_depth=plan.max_depth
-    )
+    vertices, counts = light_paths.trace(scene, caster, seed=seed, paths=np.arange(plan.num_paths), max_depth=plan.max_depth)
     found = virtual_lights.virtual_lights(scene, vertices, num_paths=plan.num_paths, sizes=sizes)
     return found, {**counts, "num_lights": len(vertices.path)}
 

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Float, UInt
 
 from jaxvol import media, ray_casting, sampling
-from jaxvol import lights as primary
 from jaxvol.methods.instant_multiple_scattering import compensation, gathering, picking, receivers
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
@@ -173,9 +172,7 @@ def subset(lights: VirtualLights, offset: Array, *, stride: int) -> VirtualLight
 
     scaled = jax.tree.map(thin, lights)
     specular = None if scaled.specular is None else scaled.specular * stride
-    return VirtualLights(
-        scaled.position, scaled.direction, scaled.strength * stride, scaled.normal, specular, scaled.exponent
-    )
+    return VirtualLights(scaled.position, scaled.direction, scaled.strength * stride, scaled.normal, specular, scaled.exponent)
 
 
 def eye_vertices(context: Context, segments: Segments, u: Float[Array, "n"]) -> tuple[Points, Float[Array, "n 3"]]:

@@ -77,14 +77,10 @@ def _on_surface(mesh, vertices, num_paths, size):
         return VirtualLights(position, _pad(mirrored, size), _pad(strength, size), normal)
     exponent = np.asarray(mesh.exponent)[face]
     lobe = incident * np.asarray(mesh.specular)[face] * ((exponent + 2.0) / (2.0 * np.pi))[:, None]
-    return VirtualLights(
-        position, _pad(mirrored, size), _pad(strength, size), normal, _pad(lobe, size), _pad(exponent, size)
-    )
+    return VirtualLights(position, _pad(mirrored, size), _pad(strength, size), normal, _pad(lobe, size), _pad(exponent, size))
 
 
-def virtual_lights(
-    scene: Scene, vertices: Vertices, *, num_paths: int, sizes: dict[str, int] | None = None
-) -> LightSet:
+def virtual_lights(scene: Scene, vertices: Vertices, *, num_paths: int, sizes: dict[str, int] | None = None) -> LightSet:
     """Turn path vertices (numpy) into sets of lights; `num_paths` counts ALL emitted paths, also those that missed.
 
     `sizes` are array sizes to keep where they suffice, so that the next set of lights needs no compilation.

@@ -77,9 +77,7 @@ def test_stratified_points_have_the_same_mean(segments, lights):
     n = 4096
     many = jax.tree.map(lambda x: x if x.ndim == 0 else jnp.repeat(x, n, axis=0), segments)
     u = jnp.tile((jnp.arange(n, dtype=jnp.float32) + 0.5) / n, 4)
-    found = gathering.gather_segments(
-        many, u, lights, medium, grey=True, isotropic=False, stratified=True, num_evaluations=2
-    )
+    found = gathering.gather_segments(many, u, lights, medium, grey=True, isotropic=False, stratified=True, num_evaluations=2)
     for ray in range(4):
         mean = np.asarray(found).reshape(4, n, 3)[ray].mean(axis=0)
         np.testing.assert_allclose(mean, exact_segment(segments, lights, medium, ray), rtol=3e-4)
