@@ -1,0 +1,186 @@
+"""Stage 1, lookup: the tables resampled for one medium, then one interpolation per query (sections 4.3 to 4.5).
+
+`prepare` contracts the Chebyshev tables for a medium's albedo, g and phase moments, channel by channel, onto grids that are
+uniform in tau^(1/4) and, for area emitters, in sign(pi/2 - theta_n) |theta_n / (pi/2) - 1|^(1/2): the variables in which the
+tables are smooth. A query interpolates linearly and puts the exponentials back. With tau the optical thickness of the
+segment and d its length, the effective sigma_t is tau / d (section 4.4: the mean along the segment) and sigma_s = albedo tau / d, so
+
+    point, area:  L_l = albedo tau / d^2 { e^-tau S_l(tau) + albedo tau G_l(tau) }     for I0 = 1 or Le dA = 1
+    directional:  L_l = albedo e^-tau S_l(tau) + albedo^2 G_l(tau)                     for E0 = 1
+
+S is light scattered once, G twice or more; directly attenuated light is not in them. Coefficients are of radiance as a
+function of the direction toward the light, about the axis receiver -> source.
+"""
+
+from functools import partial
+from math import pi
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxvol import media, zonal_lookup
+from jaxvol.types import Medium
+
+
+class ResponseGrid(eqx.Module):
+    """One emitter's response in one channel; emitters without an angle have one node of it."""
+
+    single: Float[Array, "tau angle bands"]  # S
+    multiple: Float[Array, "tau angle bands"] | None  # G e^{kappa tau}
+    kappa: Float[Array, ""] | None  # slowest decay of G per unit of tau
+    quarter_max: Float[Array, ""]  # tau^(1/4) at the last node
+    multiple_max: Float[Array, ""]  # tau beyond which G is an exponential
+
+
+class Responses(eqx.Module):
+    """What a medium answers to each kind of emitter; one entry per channel, or a single one for a grey medium."""
+
+    point: tuple[ResponseGrid, ...]
+    directional: tuple[ResponseGrid, ...]
+    area: tuple[ResponseGrid, ...]
+    albedo: Float[Array, "3"]  # single-scattering albedo
+    transport: Float[Array, "3"]  # sigma_t' / sigma_t = 1 - albedo g
+
+
+def prepare(
+    tables: zonal_lookup.ZonalTables,
+    medium: Medium,
+    *,
+    grey: bool,
+    multiple: bool,
+    num_tau: int = 192,
+    num_angle: int = 33,
+) -> Responses:
+    """Resample the tables for a medium's phase function and albedo; `grey` shares one channel among three.
+
+    Linear interpolation costs at most 4e-4 of band 0 with the default nodes (tests/methods/impulse_response). Raises ValueError
+    where the tables lack an emitter or, with `multiple`, the infinite sum.
+    """
+    for kind in ("point", "directional", "area"):
+        table = getattr(tables, kind)
+        if table is None:
+            raise ValueError(f"the table file lacks the emitter {kind!r}; baking needs point, directional and area")
+        if multiple and table.multiple is None:
+            raise ValueError(f"the table file has no multiple scattering of {kind!r}; set scattering = 'single'")
+    return _prepare(tables, medium, grey=grey, multiple=multiple, num_tau=num_tau, num_angle=num_angle)
+
+
+@partial(jax.jit, static_argnames=("grey", "multiple", "num_tau", "num_angle"))
+def _prepare(tables, medium, *, grey, multiple, num_tau, num_angle):
+    albedo = media.single_scattering_albedo(medium)
+    moments = None if medium.phase is None else medium.phase.moments
+    g = medium.g if medium.phase is None else medium.phase.moments[1]
+    channels = 1 if grey else 3
+    grids = {}
+    for kind in ("point", "directional", "area"):
+        angles = num_angle if kind == "area" else 1
+        make = partial(_grid, tables, kind, moments=moments, g=g, multiple=multiple, num_tau=num_tau, num_angle=angles)
+        grids[kind] = tuple(make(albedo=albedo[i]) for i in range(channels))
+    return Responses(**grids, albedo=albedo, transport=1 - albedo * g)
+
+
+def _grid(tables, kind, *, moments, g, albedo, multiple, num_tau, num_angle):
+    response = zonal_lookup.medium_response(tables, kind, moments=moments, g=g, albedo=albedo)
+    dtype = response.single.dtype
+    last = jnp.sqrt(jnp.sqrt(response.single_range[1]))
+    quarter = jnp.linspace(0, 1, num_tau, dtype=dtype) * last
+    tau = quarter * quarter * quarter * quarter
+    if kind == "area":
+        v = jnp.linspace(-1, 1, num_angle, dtype=dtype)
+        theta = pi / 2 * (1 - jnp.sign(v) * v * v)
+        # The table is two-sided at pi/2, where both series hold the same value: any side will do.
+        tau, theta = jnp.broadcast_arrays(tau[:, None], theta[None, :])
+        once = zonal_lookup.scaled_single(response, tau, theta)
+    else:
+        tau, theta = tau[:, None], None
+        once = zonal_lookup.scaled_single(response, tau)
+    if not multiple:
+        return ResponseGrid(once, None, None, last, response.single_range[1])
+    limit = response.multiple_range[1]
+    more = zonal_lookup.scaled_multiple(response, jnp.minimum(tau, limit), theta)
+    more = more * jnp.exp(response.kappa * jnp.minimum(tau, limit))[..., None]
+    return ResponseGrid(once, more, response.kappa, last, limit)
+
+
+def _nodes(grid: ResponseGrid, tau, angle):
+    """Flat indices and weights of the two or four nodes about a query."""
+    num_tau, num_angle, _ = grid.single.shape
+    positive = tau > 1e-12
+    quarter = jnp.where(positive, jnp.sqrt(jnp.sqrt(jnp.where(positive, tau, 1))), 0)
+    x = jnp.minimum(quarter / grid.quarter_max, 1) * (num_tau - 1)
+    i = jnp.clip(x.astype(jnp.int32), 0, num_tau - 2)
+    f = x - i
+    if num_angle == 1:
+        return ((i, 1 - f), (i + 1, f))
+    y = jnp.clip(angle * 0.5 + 0.5, 0, 1) * (num_angle - 1)
+    j = jnp.clip(y.astype(jnp.int32), 0, num_angle - 2)
+    h = y - j
+    row = i * num_angle + j
+    return (
+        (row, (1 - f) * (1 - h)),
+        (row + 1, (1 - f) * h),
+        (row + num_angle, f * (1 - h)),
+        (row + num_angle + 1, f * h),
+    )
+
+
+def _interpolate(values, nodes):
+    flat = values.reshape(-1, values.shape[-1])
+    return sum(flat[index] * weight[..., None] for index, weight in nodes)
+
+
+def angle_variable(cos_n: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """The grid's variable of the angle between a patch's normal and the way to the receiver: 1 facing, 0 edge-on, -1 behind."""
+    off = 1 - jnp.arccos(jnp.clip(cos_n, -1, 1)) * (2 / pi)
+    far = jnp.abs(off) > 1e-6
+    return jnp.where(far, jnp.sign(off) * jnp.sqrt(jnp.where(far, jnp.abs(off), 1)), 0)
+
+
+def compact_source(
+    grids: tuple[ResponseGrid, ...],
+    albedo: Float[Array, "3"],
+    tau: Float[Array, "*b 3"],
+    distance: Float[Array, "*b 3"],
+    cos_n: Float[Array, "*b 3"] | None,
+) -> tuple[Float[Array, "*b C bands"], Float[Array, "*b C bands"] | None]:
+    """Incident radiance of a point (cos_n None) or patch with I0 or Le dA = 1: (scattered once, twice or more or None).
+
+    Per channel C of the grids. tau is the optical thickness of the segment, distance > 0 its length (which image sources make
+    another one in each channel). Beyond the table's tau the response falls like e^{-kappa tau} / tau.
+    """
+    once, more = [], []
+    for channel, grid in enumerate(grids):
+        t, d = tau[..., channel], distance[..., channel]
+        nodes = _nodes(grid, t, None if cos_n is None else angle_variable(cos_n[..., channel]))
+        scale = albedo[channel] * t / (d * d)
+        table_end = grid.quarter_max * grid.quarter_max * grid.quarter_max * grid.quarter_max
+        spread = jnp.minimum(1, table_end / jnp.maximum(t, 1e-12))
+        once.append((scale * spread * jnp.exp(-t))[..., None] * _interpolate(grid.single, nodes))
+        if grid.multiple is not None:
+            past = jnp.minimum(1, grid.multiple_max / jnp.maximum(t, 1e-12))
+            factor = scale * albedo[channel] * t * past * jnp.exp(-grid.kappa * t)
+            more.append(factor[..., None] * _interpolate(grid.multiple, nodes))
+    return jnp.stack(once, axis=-2), jnp.stack(more, axis=-2) if more else None
+
+
+def directional_source(
+    grids: tuple[ResponseGrid, ...], albedo: Float[Array, "3"], tau: Float[Array, "*b 3"]
+) -> tuple[Float[Array, "*b C bands"], Float[Array, "*b C bands"] | None]:
+    """Incident radiance of a directional light of irradiance 1 at optical depth tau of a half-space lit straight down."""
+    once, more = [], []
+    for channel, grid in enumerate(grids):
+        t = tau[..., channel]
+        nodes = _nodes(grid, t, None)
+        once.append((albedo[channel] * jnp.exp(-t))[..., None] * _interpolate(grid.single, nodes))
+        if grid.multiple is not None:
+            factor = albedo[channel] * albedo[channel] * jnp.exp(-grid.kappa * t)
+            more.append(factor[..., None] * _interpolate(grid.multiple, nodes))
+    return jnp.stack(once, axis=-2), jnp.stack(more, axis=-2) if more else None
+
+
+def num_outside(responses: Responses, tau: Float[Array, "*b 3"]) -> Int[Array, ""]:
+    """How many queries lie beyond the tables' tau, where the responses are continued as exponentials."""
+    grid = responses.point[0]
+    return jnp.sum(jnp.max(tau, axis=-1) > grid.multiple_max)

@@ -1,0 +1,95 @@
+"""Stage 4, rendering: what eye rays meet first, shaded with the baked quantities."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxvol import camera as cameras
+from jaxvol import first_hit, sampling, zonal_lookup
+from jaxvol.layers import SURFACE, from_items
+from jaxvol.methods.impulse_response import estimate, gather, planning
+from jaxvol.methods.impulse_response.planning import Plan
+from jaxvol.types import Camera, Estimate, Rays, Scene
+
+_STREAM = sampling.stream("impulse_response.pixels")
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    seed: int = 0,
+    samples: int = 16,
+    tables: zonal_lookup.ZonalTables | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Estimate:
+    """Reflected light of the first surfaces, attenuated on its way to the eye, by layer; box-filtered pixels.
+
+    Raises ValueError for samples < 1. Cost: `samples` surface paths a pixel.
+    """
+    if samples < 1:
+        raise ValueError(f"samples: {samples} is not allowed, must be >= 1")
+    kit = planning.prepare(scene, plan, responses_from=tables)
+    total = camera.height * camera.width
+    lanes = estimate.lanes_for(total, plan.num_lanes)
+    mean = {name: np.zeros((total, 3)) for name in SURFACE}
+    square = {name: np.zeros((total, 3)) for name in SURFACE}
+    for sample in range(samples):
+        for first in range(0, total, lanes):
+            pixel = jnp.minimum(first + jnp.arange(lanes), total - 1)
+            found = _one_sample(kit, camera, pixel, jnp.full(lanes, sample, jnp.int32), jnp.uint32(seed))
+            rows = slice(first, min(first + lanes, total))
+            for name, value in found.items():
+                value = np.asarray(value, np.float64)[: total - first]
+                mean[name][rows] += value
+                square[name][rows] += value * value
+            if on_progress is not None:
+                on_progress((sample + min(first + lanes, total) / total) / samples)
+    shape = (camera.height, camera.width, 3)
+    means, variances = {}, {}
+    for name in SURFACE:
+        average = mean[name] / samples
+        spread = np.maximum(square[name] / samples - average**2, 0) / max(samples - 1, 1)
+        means[name] = jnp.asarray(average.astype(np.float32).reshape(shape))
+        variances[name] = jnp.asarray(spread.astype(np.float32).reshape(shape))
+    return Estimate(mean=from_items(means), variance=from_items(variances), num_samples=jnp.float32(samples))
+
+
+@jax.jit
+def _pixel_rays(camera, pixel, sample, seed):
+    u = sampling.uniforms(seed, _STREAM, pixel, 0, sample)
+    row = pixel // camera.width
+    xy = jnp.stack([pixel - row * camera.width + u[0], row + u[1]], axis=-1)
+    return cameras.generate_rays(camera, xy)
+
+
+@jax.jit
+def _facing(normal, direction, valid):
+    side = jnp.where(sampling.dot(normal, direction) > 0, -1.0, 1.0)
+    return jnp.where(valid[:, None], normal * side[:, None], normal)
+
+
+@jax.jit
+def _reflect(mesh, face, valid, through, layers):
+    albedo = jnp.where(valid[:, None], mesh.albedo[jnp.maximum(face, 0)], 0.0) / jnp.pi
+    weight = albedo if through is None else albedo * through
+    return {name: weight * value for name, value in layers.items()}
+
+
+def _one_sample(kit: gather.Kit, camera, pixel, sample, seed):
+    rays: Rays = _pixel_rays(camera, pixel, sample, seed)
+    hits = first_hit.first_hits(kit.scene, rays, kit.caster)
+    normal = _facing(hits.normal, rays.direction, hits.valid)
+    direct, once, more, _ = gather.delta_arrivals(kit, hits.position, normal)
+    layers = {name: jnp.zeros_like(direct) for name in SURFACE}
+    if estimate.needs_paths(kit):
+        found = gather.path_arrivals(kit, hits.position, normal, pixel, sample, seed)
+        layers = {name: found[name] for name in SURFACE}
+    for name, value in (("surface_from_light", direct), ("surface_from_volume", once), ("surface_from_multiple", more)):
+        layers[name] = layers[name] + value
+    thick = gather.thickness(kit, rays.origin, rays.direction, jnp.where(hits.valid, hits.t, 0.0))
+    through = None if thick is None else jnp.exp(-thick)
+    return _reflect(kit.scene.mesh, hits.face, hits.valid, through, layers)
