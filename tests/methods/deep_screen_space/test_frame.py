@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import SMALL, lamp, lumps, make_medium, make_mesh, room
+from tests.methods.deep_screen_space.conftest import SMALL, lamp, lumps, make_medium, make_mesh, room
 
 from jaxvol import media
 from jaxvol.methods import deep_screen_space as method

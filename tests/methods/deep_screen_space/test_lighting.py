@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import make_medium, make_mesh
+from tests.methods.deep_screen_space.conftest import make_medium, make_mesh
 
 from jaxvol import lights, ray_casting
 from jaxvol.methods.deep_screen_space import lighting

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import SMALL
+from tests.methods.deep_screen_space.conftest import SMALL
 
 from jaxvol.methods import deep_screen_space as method
 from jaxvol.methods.deep_screen_space import framebuffer, splatting
