@@ -24,7 +24,7 @@ from deep_screen_space_common import (
 
 def against_a3(name, settings):
     """Rows of errors over blocks, and the three pictures (the reference only in its blocks)."""
-    problem, camera = load(name)
+    problem, camera = load(name, width=settings["width"], height=settings["height"])
     pixels = blocks_with_medium(problem, camera, size=settings["block"], num=settings["num_blocks"])
     mean, variance, seconds = path_traced(problem, camera, pixels, num_samples=settings["samples"])
     images = {"ours": layer(problem, camera), "paper": layer(problem, camera, **PAPER)}
@@ -42,7 +42,7 @@ def against_a3(name, settings):
 
 def against_pairs(name, settings):
     """Rows: ours against A1, ours against all its pairs, A1 against A2."""
-    problem, camera = load(name)
+    problem, camera = load(name, width=settings["width"], height=settings["height"])
     pixels = blocks_with_medium(problem, camera, size=1, num=settings["num_pair_pixels"]).reshape(-1)
     plan = method.plan(problem, camera, num_surfels=settings["pair_surfels"])
     ours = layer(problem, camera, num_surfels=settings["pair_surfels"]).reshape(-1, 3)[pixels]
@@ -64,7 +64,8 @@ def main():
         found, images = against_a3(name, settings)
         rows += found
         shown.append(images)
-        rows += against_pairs(name, settings)
+        if settings["num_pair_pixels"]:
+            rows += against_pairs(name, settings)
         write_csv(
             "comparison.csv", ["scene", "what", "reference", "relative_l1", "bias", "reference_noise", "reference_cpu_s"], rows
         )

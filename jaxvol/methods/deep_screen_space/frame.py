@@ -55,6 +55,7 @@ def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Pla
         active.origin,
         active.direction,
         active.map.distance,
+        active.map.weight,
         active.num_rays,
         jnp.uint32(seed),
         resolution=plan.table_resolution,

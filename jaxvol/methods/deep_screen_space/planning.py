@@ -82,13 +82,13 @@ def plan(
     blur: str = "demodulated",
     pattern: str = "congruent",
     cluster_size: int = 256,
-    table_resolution: int = 16,
+    table_resolution: int = 24,
     dense_from: int = 3,
     strides: tuple[int, ...] | None = None,
     num_area_samples: int = 4,
     num_environment_samples: int = 8,
     light_steps: int = 32,
-    transport_steps: int = 8,
+    transport_steps: int = 12,
     specialize: str = "values",
 ) -> Plan:
     """Check the options, look at the scene, decide what to skip. Eager.

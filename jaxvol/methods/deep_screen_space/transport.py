@@ -3,7 +3,7 @@
 A table of transmittance times visibility over (cluster of surfels, cell of a coarse grid around the samples), built
 anew for every frame: one segment per entry, from a surfel of the cluster to one of the samples in the cell. The
 splat looks it up once per sample for all surfels of a cluster. Each entry takes another surfel of the cluster, chosen
-by flux times cosine, so that the error of standing for the cluster is noise between cells and not a bias; samples look
+by what it sends there, so that the error of standing for the cluster is noise between cells and not a bias; samples look
 up a cell next to theirs with the probability of trilinear interpolation.
 """
 
@@ -19,14 +19,14 @@ from jaxvol import ray_casting, sampling
 from jaxvol.methods.deep_screen_space.lighting import LitSurfels
 
 _STREAM = sampling.stream("deep_screen_space.transport")
-_CANDIDATES = 8  # surfels of a cluster among which an entry chooses
+_CANDIDATES = 12  # surfels of a cluster among which an entry chooses
 _MARGIN = 1e-4
 
 
 class Cells(eqx.Module):
     """The samples' cells in a grid of resolution^3 over their bounding box, and one sample of each cell.
 
-    A sample drawn by lot, not their mean: transmittance is convex, so that the mean place would make it too small (by
+    A sample drawn by its weight, not their mean: transmittance is convex, so that the mean place would make it too small (by
     14 % of the layer in a dense cloud).
     """
 
@@ -40,6 +40,7 @@ def locate(
     origin: Float[Array, "3"],
     direction: Float[Array, "A 3"],
     distance: Float[Array, "N A"],
+    weight: Float[Array, "M 3 A"],
     num_rays: int,
     seed,
     *,
@@ -58,8 +59,8 @@ def locate(
         index = index * resolution + jnp.clip(coordinate.astype(jnp.int32), 0, resolution - 1)
     cells = resolution**3
     slot = jnp.where(real, index, cells)
-    # One sample of every cell, drawn by lot: the largest ticket, and the places of its holder.
-    ticket = jnp.where(real, jitter[3], 0.0)
+    # One sample of every cell, drawn with its weight: the largest ticket w/(-log u), and the place of its holder.
+    ticket = jnp.where(real, jnp.mean(weight, axis=1) / -jnp.log(jitter[3]), 0.0)
     largest = jnp.zeros(cells, jnp.float32).at[slot].max(ticket, mode="drop")
     winner = jnp.where(ticket == largest[index], slot, cells)
     chosen = [jnp.zeros(cells, jnp.float32).at[winner].set(p, mode="drop") for p in points]
@@ -72,7 +73,8 @@ def representatives(
 ) -> tuple[Float[Array, "C U 3"], Float[Array, "C U 3"], Float[Array, "C U"]]:
     """For every cluster and receiving point a surfel: position, direction to the point, and the distance (0: none lit).
 
-    Of a few surfels drawn by flux one is drawn by flux times cosine (resampled importance sampling).
+    Of a few surfels drawn by flux one is drawn by flux cos/d^2, what it sends (resampled importance sampling): the
+    nearest surfels of a cluster send most and are dimmed least.
     """
     num_clusters = lit.area.shape[0] // cluster_size
     flux = (jnp.max(lit.radiance, axis=-1) * lit.area).reshape(num_clusters, cluster_size)
@@ -88,8 +90,9 @@ def representatives(
     weight_sum = jnp.zeros(chosen.shape, jnp.float32)
     for k in range(_CANDIDATES):  # weighted reservoir: one pass, one candidate kept
         delta = points - position[:, k, None]
-        cosine = sampling.dot(delta, normal[:, k, None]) * jax.lax.rsqrt(jnp.maximum(sampling.dot(delta, delta), 1e-30))
-        weight = jnp.maximum(cosine, 1e-4)
+        squared = jnp.maximum(sampling.dot(delta, delta), 1e-12)
+        cosine = sampling.dot(delta, normal[:, k, None]) * jax.lax.rsqrt(squared)
+        weight = jnp.maximum(cosine, 1e-4) / squared
         weight_sum = weight_sum + weight
         take = u * weight_sum < weight
         u = jnp.where(take, u * weight_sum / weight, (u * weight_sum - weight) / jnp.maximum(weight_sum - weight, 1e-30))
