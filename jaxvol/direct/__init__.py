@@ -6,8 +6,9 @@ Stages: `first_hit` (surfaces, emission, transmittance to the eye), `surface` (L
 Point, spot and directional lights: positions inside the pixel and nodes on the eye ray are midpoint rules, the same for
 every seed; the error is that of the rules (edges, density changes within a cell). Emissive faces and the environment:
 low-discrepancy sets, shifted per pixel by a hash of the seed; unbiased but for transmittance, which is marched with one
-step a voxel (second order). Equi-angular steps: Kulla and Fajardo 2012, "Importance Sampling Techniques
-for Path Tracing in Participating Media"; transmittance-warped steps: the same integral inverted numerically.
+step per voxel from the eye and per two voxels towards lights (second order). Equi-angular steps: Kulla and Fajardo 2012,
+"Importance Sampling Techniques for Path Tracing in Participating Media"; transmittance-warped steps: the same integral
+inverted numerically.
 
 Cannot: refraction (refused), more than one scattering event.
 """
@@ -115,7 +116,7 @@ def _surface_pass(kit: Context, rays: Rays, item, sample, seed) -> dict[str, Flo
     scene, plan = kit.scene, kit.plan
     hits = first_hit.first_hits(scene, rays, kit.caster)
     through = first_hit.transmittance(
-        scene, rays, hits, casters=kit.medium_casters, num_steps=plan.num_light_steps, marching=kit.marching
+        scene, rays, hits, casters=kit.medium_casters, num_steps=plan.num_cells, marching=kit.marching
     )
     found = {}
     if plan.emission:

@@ -99,7 +99,8 @@ def _connections(context: Context, run: LightRun, cells, origin, direction, pixe
             yield _to_point(*data, k, kind="area", **sizes)
     else:
         sizes = {"num_samples": num_samples, "num_phase": plan.num_phase_steps}
-        yield _to_sky(*data, num_steps=plan.num_environment_steps, directional=False, **sizes)
+        if plan.num_environment_steps:
+            yield _to_sky(*data, num_steps=plan.num_environment_steps, directional=False, **sizes)
         if plan.num_phase_steps:
             yield _along_phase(*data, num_steps=plan.num_environment_steps, **sizes)
 

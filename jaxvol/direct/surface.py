@@ -30,8 +30,9 @@ def surface_light(
         num_light = num_light_samples(plan, run)
         num_bsdf = 0 if run.kind in DELTA else plan.num_bsdf_samples
         sizes = {"num_light": num_light, "num_bsdf": num_bsdf, "kind": run.kind}
-        towards = connect(run.scene, run.emitters, rays.direction, hits, pixel, sample, seed, **sizes)
-        total = total + resolve(context, run, towards)
+        if num_light:
+            towards = connect(run.scene, run.emitters, rays.direction, hits, pixel, sample, seed, **sizes)
+            total = total + resolve(context, run, towards)
         if num_bsdf and run.kind == "environment":
             along = connect_along_bsdf(run.scene, rays.direction, hits, pixel, sample, seed, **sizes)
             total = total + resolve(context, run, along)
