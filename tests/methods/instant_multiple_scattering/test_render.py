@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import layers
+from jaxvol import camera as pinhole
+from jaxvol import layers, media
 from jaxvol.methods import instant_multiple_scattering as ims
 from jaxvol.methods.instant_multiple_scattering import rendering, upsampling, virtual_lights
 from jaxvol.methods.instant_multiple_scattering.upsampling import Guides
@@ -18,7 +19,7 @@ SMALL = {"num_paths": 64, "num_levels": 1, "tile": 64}
 
 
 def test_infinite_medium():
-    """Radiance of light scattered at least twice along a ray past a point source: mean of 64 sets of lights."""
+    """Radiance of light scattered at least twice along a ray past a point source: mean of 32 sets of lights."""
     medium = make_medium(sigma_s=(0.9,) * 3, sigma_a=(0.1,) * 3, half=20.0)
     scene = lit(medium, position=(0.0, 1.0, 0.0))
     plan = ims.plan(scene, make_camera(), num_paths=512, light_stride=1, jitter=False)
@@ -31,7 +32,7 @@ def test_infinite_medium():
         jnp.arange(lanes, dtype=jnp.uint32),
     )
     values, sizes = [], {}
-    for k in range(24):
+    for k in range(32):
         context, _ = rendering.make_context(scene, plan, seed=k, sizes=sizes)
         sizes.update(virtual_lights.sizes(context.lights))
         found = rendering.gather_rays(context, *rays)
@@ -159,3 +160,23 @@ def test_low_resolution_evaluates_fewer_pixels():
     assert int(estimate.diagnostics["num_evaluated"]) < 200
     a, b = (float(jnp.mean(layers.total(e.mean))) for e in (estimate, exact))
     assert a == pytest.approx(b, rel=0.2)
+
+
+def test_jittered_pixels_weigh_what_lies_behind_them():
+    """Mean of the weight times what is seen of a unit source = its mean over the pixel, at the edge of the medium too."""
+    scene, camera = lit(make_medium()), make_camera(8)
+    n = 4096
+    index = jnp.arange(n, dtype=jnp.uint32)
+    for corner in ([1.0, 2.0], [0.0, 4.0]):
+        xy = jnp.tile(floats(corner), (n, 1))
+        places, weight = rendering.choose_in_pixel(scene, camera, xy, index, jnp.uint32(3))
+        assert bool(jnp.all((places >= xy) & (places <= xy + 1)))
+
+        def source(p):
+            rays = pinhole.generate_rays(camera, p)
+            t0, t1 = media.box_interval(scene.medium.bounds, rays.origin, rays.direction)
+            return 1 - jnp.exp(-(t1 - t0))
+
+        grid = (jnp.stack(jnp.meshgrid(jnp.arange(64), jnp.arange(64)), -1).reshape(-1, 2) + 0.5) / 64
+        exact = float(jnp.mean(source(floats(corner) + grid)))
+        assert float(jnp.mean(weight * source(places))) == pytest.approx(exact, rel=5e-3)
