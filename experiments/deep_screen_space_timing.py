@@ -68,7 +68,8 @@ def forms(settings):
         image = np.asarray(estimate.mean.volume_from_surface)
         error = np.abs(image - every).sum() / every.sum()
         rows.append([name, sum(clock.cpu.values()), splat, pairs, 1e9 * splat / pairs, error])
-    write_csv("timing_forms.csv", ["form", "frame_cpu_s", "splat_cpu_s", "pairs", "ns_per_pair", "error_against_all_pairs"], rows)
+    header = ["form", "frame_cpu_s", "splat_cpu_s", "pairs", "ns_per_pair", "error_against_all_pairs"]
+    write_csv("timing_forms.csv", header, rows)
     return problem, camera, rows
 
 

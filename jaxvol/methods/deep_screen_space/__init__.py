@@ -17,7 +17,7 @@ cluster of surfels. Biased by the blur, by the transport table and by the size o
 each, and `references` measures them apart.
 """
 
-from jaxvol.methods.deep_screen_space.planning import Plan, claims, plan
 from jaxvol.methods.deep_screen_space.frame import render
+from jaxvol.methods.deep_screen_space.planning import Plan, claims, plan
 
 __all__ = ["Plan", "claims", "plan", "render"]

@@ -13,7 +13,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxvol import lights, materials, phase, ray_casting, sampling
 from jaxvol.methods.deep_screen_space import frame, kernel, splatting

@@ -4,12 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.methods.deep_screen_space.conftest import SMALL, lamp, lumps, make_medium, make_mesh, room
 
 from jaxvol import media
 from jaxvol.methods import deep_screen_space as method
 from jaxvol.methods.deep_screen_space import frame, references, splatting
 from jaxvol.types import Mesh, Scene
+from tests.methods.deep_screen_space.conftest import SMALL, lamp, lumps, make_medium, make_mesh, room
 
 ALL_PAIRS = SMALL | {"num_levels": 1, "strides": (1,), "dense_from": 0, "blur": "none"}
 

@@ -3,13 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.methods.deep_screen_space.conftest import make_medium, make_mesh
 
 from jaxvol import lights, ray_casting
 from jaxvol.methods.deep_screen_space import lighting
 from jaxvol.methods.deep_screen_space import surfels as sf
 from jaxvol.methods.deep_screen_space.camera_rays import transmittance_of
 from jaxvol.types import DirectionalLights, Mesh, PointLights, Scene
+from tests.methods.deep_screen_space.conftest import make_medium, make_mesh
 
 FLOOR = ([-1, 0, 1], [2, 0, 0], [0, 0, -2])  # front side up
 ALBEDO = np.array([0.5, 0.4, 0.2])
@@ -95,9 +95,8 @@ def test_glossy_entries_carry_the_mirrored_light():
 @pytest.mark.parametrize("num", [1, 7, 64, 1000])
 def test_strata_are_compact_and_complete(num):
     rng = np.random.default_rng(0)
-    cloud = lighting.LitSurfels(
-        *(a.astype(np.float32) for a in (rng.random((num, 3)), np.tile([0, 0, 1.0], (num, 1)), np.ones(num), rng.random((num, 3))))
-    )
+    fields = rng.random((num, 3)), np.tile([0, 0, 1.0], (num, 1)), np.ones(num), rng.random((num, 3))
+    cloud = lighting.LitSurfels(*(a.astype(np.float32) for a in fields))
     ordered = lighting.order_for_strata(cloud, capacity=1024)
     assert sorted(ordered.position[:num, 0]) == sorted(cloud.position[:, 0]) and (ordered.area[num:] == 0).all()
     if num == 1000:

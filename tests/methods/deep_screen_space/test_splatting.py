@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from tests.methods.deep_screen_space.conftest import SMALL
 
 from jaxvol.methods import deep_screen_space as method
 from jaxvol.methods.deep_screen_space import framebuffer, splatting
+from tests.methods.deep_screen_space.conftest import SMALL
 
 BARE = SMALL | {"transport": "none", "blur": "none"}
 
