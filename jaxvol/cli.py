@@ -17,6 +17,7 @@ import jaxvol
 COMMANDS = {
     "render": "Render a scene file to EXR, PNG and JSON.",
     "compare": "Print the error of one EXR picture against another as JSON.",
+    "bake": "Bake light onto surfaces and into probes: EXR lightmap, GLB, .npz.",
     "tabulate": "Compute or verify tables of impulse responses.",
     "fit": "Run the fits behind the tables; CSV and figures.",
     "schema": "Print the JSON schema of scene files.",

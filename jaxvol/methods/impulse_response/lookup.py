@@ -3,7 +3,7 @@
 `prepare` contracts the Chebyshev tables for a medium's albedo, g and phase moments, channel by channel, onto grids that are
 uniform in tau^(1/4) and, for area emitters, in sign(pi/2 - theta_n) |theta_n / (pi/2) - 1|^(1/2): the variables in which the
 tables are smooth. A query interpolates linearly and puts the exponentials back. With tau the optical thickness of the
-segment and d its length, the effective sigma_t is tau / d (section 4.4: the mean along the segment) and sigma_s = albedo tau / d, so
+segment and d its length, the effective sigma_t is tau / d (section 4.4: the mean along the segment), sigma_s = albedo tau / d:
 
     point, area:  L_l = albedo tau / d^2 { e^-tau S_l(tau) + albedo tau G_l(tau) }     for I0 = 1 or Le dA = 1
     directional:  L_l = albedo e^-tau S_l(tau) + albedo^2 G_l(tau)                     for E0 = 1

@@ -1,0 +1,74 @@
+"""Stage 3, baking: receivers in parts that survive a kill, with progress; the same numbers however it is cut."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxvol.jobs import Parts, Stop
+from jaxvol.layers import SURFACE
+from jaxvol.methods.impulse_response import estimate, gather
+from jaxvol.methods.impulse_response.planning import Plan
+
+_PART = 4096  # receivers at a time
+
+
+class Baked(NamedTuple):
+    """Irradiance at receivers by layer, variance of its total, and the share of scattered light that occluders took."""
+
+    irradiance: dict[str, np.ndarray]  # each [N, 3]
+    variance: np.ndarray  # [N, 3], sum over layers
+    occluded_share: float
+
+
+class Interrupted(Exception):
+    """The user stopped the bake; finished parts are kept."""
+
+
+def bake(
+    kit: gather.Kit,
+    plan: Plan,
+    points: np.ndarray,
+    normals: np.ndarray,
+    *,
+    name: str,
+    samples: int,
+    seed: int = 0,
+    parts: Parts | None = None,
+    stop: Stop | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Baked:
+    """Bake receivers [N, 3] in parts called `name-<number>`; parts that are done are taken from the store.
+
+    `on_progress` gets the number of receivers that were finished. Raises `Interrupted` between parts once `stop` is set.
+    """
+    found = []
+    for number, first in enumerate(range(0, len(points), _PART)):
+        rows = slice(first, first + _PART)
+        label = f"{name}-{number}"
+        done = None if parts is None else parts.get(label)
+        if done is None:
+            if stop:
+                raise Interrupted(f"{first} of {len(points)} receivers of {name} are done")
+            result = estimate.bake(kit, points[rows], normals[rows], plan, samples=samples, seed=seed, first_item=first)
+            done = {layer: np.asarray(getattr(result.mean, layer)) for layer in SURFACE}
+            done["variance"] = sum(np.asarray(getattr(result.variance, layer)) for layer in SURFACE)
+            done["occluded_share"] = np.asarray(result.diagnostics["occluded_share"])
+            if parts is not None:
+                parts.put(label, done)
+        found.append(done)
+        if on_progress is not None:
+            on_progress(len(done["variance"]))
+    once = np.array([part["surface_from_volume"].sum() for part in found], np.float64)
+    share = np.array([float(part["occluded_share"]) for part in found])
+    lost = once * share / np.maximum(1 - share, 1e-6)
+    return Baked(
+        irradiance={layer: np.concatenate([part[layer] for part in found]) for layer in SURFACE},
+        variance=np.concatenate([part["variance"] for part in found]),
+        occluded_share=float(lost.sum() / max(once.sum() + lost.sum(), 1e-30)),
+    )
+
+
+def total(baked: Baked) -> np.ndarray:
+    """Irradiance over all layers [N, 3]."""
+    return sum(baked.irradiance.values())
