@@ -11,7 +11,9 @@ face normals), index-matched media in `null` boundaries, box filter. What differ
 * Mitsuba's rays start (1 + |position|) 9e-5 away from surfaces, whatever the scene's size: export scenes of less than
   about a unit with `scale` (lengths times s, sigma over s, intensities times s^2; radiance stays).
 
-Not expressible, refused: the Phong lobe (Mitsuba 3 has none), refractive indices, inclusions that stick out.
+* Mitsuba has no Phong lobe: such surfaces name `jaxvol_phong`, which `mitsuba_phong.register` makes known.
+
+Not expressible, refused: refractive indices, media that stick out of their bounds or inclusions out of their medium.
 """
 
 import os
@@ -23,7 +25,7 @@ from xml.etree import ElementTree
 import numpy as np
 import trimesh
 
-from jaxvol import image, jobs, media, segments, volumes
+from jaxvol import image, jobs, media, mitsuba_phong, segments, volumes
 from jaxvol.types import Camera, EnvironmentLight, Medium, Mesh, Scene
 from jaxvol.volumes import Volume
 
@@ -43,6 +45,7 @@ _TAGS = {
     "twosided": "bsdf",
     "diffuse": "bsdf",
     "null": "bsdf",
+    mitsuba_phong.NAME: "bsdf",
     "area": "emitter",
     "point": "emitter",
     "spot": "emitter",
@@ -145,8 +148,6 @@ def _describe(scene, camera, folder, integrator, max_depth, samples, scale) -> d
         raise ValueError(f"integrator: {integrator!r} is not allowed, must be volpath or volpathmis")
     if max_depth < -1 or samples < 1 or not 0 < scale < np.inf:
         raise ValueError("max_depth must be >= -1, samples >= 1, scale > 0 and finite")
-    if scene.mesh is not None and scene.mesh.specular is not None and np.any(np.asarray(scene.mesh.specular) > 0):
-        raise ValueError("shapes.specular: Mitsuba 3 has no Phong lobe, so the scene cannot be exported")
     folder.mkdir(parents=True, exist_ok=True)
     medium = scene.medium if scene.medium is not None and not media.is_empty(scene.medium) else None
     described = {"type": "scene", "integrator": {"type": integrator, "max_depth": int(max_depth)}}
@@ -215,20 +216,25 @@ def _surfaces(mesh: Mesh | None, folder: Path, scale: float) -> Iterator[tuple[s
     vertices, faces = np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces)
     albedo = np.asarray(mesh.albedo, np.float64)
     emission = np.zeros_like(albedo) if mesh.emission is None else np.asarray(mesh.emission, np.float64)
-    materials, which = np.unique(np.concatenate([albedo, emission], axis=1), axis=0, return_inverse=True)
+    columns = [albedo, emission]
+    if mesh.specular is not None:
+        columns += [np.asarray(mesh.specular, np.float64), np.asarray(mesh.exponent, np.float64)[:, None]]
+    materials, which = np.unique(np.concatenate(columns, axis=1), axis=0, return_inverse=True)
     for index, material in enumerate(materials):
         name = f"surface_{index}"
         _write_ply(folder / f"{name}.ply", vertices, faces[which.reshape(-1) == index])
-        diffuse = {"type": "diffuse", "reflectance": _rgb(material[:3])}
-        shape = {
-            "type": "ply",
-            "filename": f"{name}.ply",
-            "face_normals": True,
-            "bsdf": {"type": "twosided", "bsdf": diffuse},
-        }
-        if np.any(material[3:] > 0):
-            shape["emitter"] = {"type": "area", "radiance": _rgb(material[3:])}
+        shape = {"type": "ply", "filename": f"{name}.ply", "face_normals": True, "bsdf": _bsdf(material)}
+        if np.any(material[3:6] > 0):
+            shape["emitter"] = {"type": "area", "radiance": _rgb(material[3:6])}
         yield name, shape
+
+
+def _bsdf(material: np.ndarray) -> dict[str, Any]:
+    """Of albedo, emission and, where there is a lobe, specular and exponent."""
+    if np.any(material[6:9] > 0):
+        values = (float(x) for x in np.delete(material, [3, 4, 5]))
+        return {"type": mitsuba_phong.NAME, **dict(zip(mitsuba_phong.PARAMETERS, values, strict=True))}
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(material[:3])}}
 
 
 def _refuse(medium: Medium) -> None:

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from jaxvol import camera as cameras
-from jaxvol import lights, media, mitsuba_export, volumes
+from jaxvol import lights, materials, media, mitsuba_export, mitsuba_phong, volumes
 from jaxvol.scene import make_scene
 
 RAMP = np.random.default_rng(5).uniform(0.1, 2.0, (5, 3, 4)).astype(np.float32)
@@ -163,7 +163,6 @@ def test_maps_are_exact_on_the_rows_of_mitsuba(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"shapes": [{"mesh": "builtin:plane", "reflectance": 0.2, "specular": 0.5}]}, "Phong"),
         ({"medium": {"bounds": BOX, "refractive_index": 1.3}}, "refractive_index"),
         (
             {
@@ -286,3 +285,29 @@ def test_phase_tables_agree(mitsuba):
         outgoing = [float(np.sqrt(1 - cosine**2)), 0.0, cosine]
         theirs = table.eval_pdf(context, medium, outgoing)[1]
         assert theirs == pytest.approx(float(phase.evaluate(file.scene.medium, np.float32(cosine))), abs=1e-3)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 3.5, 40.0])
+def test_phong_surfaces_agree(mitsuba, tmp_path, exponent):
+    """Value and density against our materials, on both sides; the sampler's weights are value over density."""
+    mitsuba_phong.register()
+    shape = {"mesh": "builtin:plane", "reflectance": [0.2, 0.3, 0.1], "specular": [0.5, 0.1, 0.3], "exponent": exponent}
+    file = make(shapes=[shape], medium=None)
+    (mesh,) = mitsuba.load_dict(mitsuba_export.to_mitsuba_dict(file.scene, file.camera, tmp_path)).shapes()
+    bsdf, context = mesh.bsdf(), mitsuba.BSDFContext()
+    surface = materials.surface_at(file.scene.mesh, np.zeros(40, int))
+    towards, outgoing, up = directions(80)[:40], directions(80)[40:], np.array([0.0, 0.0, 1.0], np.float32)
+    value = np.asarray(materials.evaluate(surface, up, -towards, outgoing)) * np.abs(outgoing[:, 2:])
+    pdf = np.asarray(materials.sample_pdf(surface, up, -towards, outgoing))
+    above = towards[:, 2] * outgoing[:, 2] > 0
+    assert 10 < np.sum(above) < 30
+    for i in range(40):
+        si = mitsuba.SurfaceInteraction3f()
+        si.wi = towards[i].tolist()
+        theirs, density = bsdf.eval_pdf(context, si, mitsuba.Vector3f(outgoing[i].tolist()))
+        np.testing.assert_allclose(np.array(theirs), value[i], atol=1e-4)
+        assert density == pytest.approx(float(pdf[i]) if above[i] else 0.0, abs=1e-4)
+        found, weight = bsdf.sample(context, si, (i + 0.5) / 40, mitsuba.Point2f(0.3, 0.7))
+        if found.pdf > 0:
+            again, density = bsdf.eval_pdf(context, si, found.wo)
+            np.testing.assert_allclose(np.array(weight) * density, np.array(again), rtol=1e-3)
