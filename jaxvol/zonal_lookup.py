@@ -18,7 +18,7 @@ emitters, whose normal leans to +x. Directly attenuated light is not in the tabl
 Beyond the largest tau the responses are continued as e^{-kappa tau}/tau; below the smallest they are held.
 """
 
-from math import pi
+from math import pi, sqrt
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -116,7 +116,7 @@ def _side_basis(theta, num: int):
 
 def _source_basis(theta, source_bands: tuple[int, ...], num_bands: int):
     """y_km(theta) for every source band k and the m of every receiver band, 0 for m > k: `[*batch, sources, bands]`."""
-    order = round((2 * num_bands) ** 0.5 - 0.5) if num_bands > 1 else 1
+    order = round(sqrt(2 * num_bands) - 0.5) if num_bands > 1 else 1
     values = harmonics.evaluate_half(jnp.cos(theta), jnp.sin(theta), max(*source_bands, order) + 1)
     azimuthal = np.array([m for _, m in harmonics.half_index(order)])
     bands = np.array(source_bands)[:, None]
@@ -193,7 +193,7 @@ def _sqrt_absorption(albedo):
 
 
 def scaled_single(
-    response: MediumResponse, tau: Float[Array, "*batch"], theta_n: Float[Array, "*batch"] | None = None
+    response: MediumResponse, tau: Float[Array, "*batch"], *, theta_n: Float[Array, "*batch"] | None = None
 ) -> Float[Array, "*batch bands"]:
     """S: point and area tau e^tau L / (albedo sigma_t^2), directional e^tau L / albedo. No overflow at any tau >= 0."""
     num, _, angles, _ = response.single.shape
@@ -205,7 +205,7 @@ def scaled_single(
 
 
 def scaled_multiple(
-    response: MediumResponse, tau: Float[Array, "*batch"], theta_n: Float[Array, "*batch"] | None = None
+    response: MediumResponse, tau: Float[Array, "*batch"], *, theta_n: Float[Array, "*batch"] | None = None
 ) -> Float[Array, "*batch bands"]:
     """G of light scattered twice or more (or F_n of a bounce response), continued beyond the table as e^{-kappa tau}."""
     if response.multiple is None:
@@ -242,10 +242,10 @@ def scattered_point(
     """
     distance, sigma_s, sigma_t = jnp.asarray(distance), jnp.asarray(sigma_s), jnp.asarray(sigma_t)
     tau = sigma_t * distance
-    once = scaled_single(response, tau, theta_n) * (_spread(tau, response.single_range[1]) * jnp.exp(-tau))[..., None]
+    once = scaled_single(response, tau, theta_n=theta_n) * (_spread(tau, response.single_range[1]) * jnp.exp(-tau))[..., None]
     radiance = (sigma_s / distance)[..., None] * once
     if multiple and response.multiple is not None:
-        more = scaled_multiple(response, tau, theta_n) * _spread(tau, response.multiple_range[1])[..., None]
+        more = scaled_multiple(response, tau, theta_n=theta_n) * _spread(tau, response.multiple_range[1])[..., None]
         radiance = radiance + (sigma_s * sigma_s)[..., None] * more
     return radiance
 

@@ -85,9 +85,8 @@ def test_default_set_is_complete_and_small(default):
     assert size < 1_000_000
     config = table_config.load(ROOT / "experiments" / "tables" / "default.toml")
     assert default.metadata["config"] == config.model_dump(mode="json")
-    assert {f"{kind}.{field}" for kind in ("point", "directional", "area") for field in ("single", "multiple", "bounces")} <= set(
-        default.arrays
-    )
+    expected = {f"{kind}.{field}" for kind in KINDS for field in ("single", "multiple", "bounces")}
+    assert expected <= set(default.arrays)
 
 
 def test_default_set_is_regenerated(default):
@@ -207,7 +206,7 @@ def test_single_scattering_within_1e6(lookups):
     response = zonal_lookup.medium_response(lookups, "area")
     theta = np.full(80, 1.1, np.float32)
     truth = zonal_tables.area_table(tau, 1.1)[:, 0]
-    assert np.max(np.abs(zonal_lookup.scaled_single(response, tau.astype(np.float32), theta) - truth) / truth[:, :1]) < 1e-4
+    assert np.max(np.abs(zonal_lookup.scaled_single(response, tau.astype(np.float32), theta_n=theta) - truth) / truth[:, :1]) < 1e-4
 
 
 def test_multiple_scattering_of_the_default_set(lookups):
@@ -224,7 +223,7 @@ def test_multiple_scattering_of_the_default_set(lookups):
     response = zonal_lookup.medium_response(lookups, "area", g=g, albedo=albedo)
     truth = assemble.area_response(tau, [0.4, 2.0], moments=moments, albedo=albedo, order=5, source_bands=14)
     for column, theta in enumerate((0.4, 2.0)):
-        found = zonal_lookup.scaled_multiple(response, tau, np.full(9, theta, np.float32))
+        found = zonal_lookup.scaled_multiple(response, tau, theta_n=np.full(9, theta, np.float32))
         assert np.max(np.abs(found - truth[:, column]) / truth[..., :1].max(axis=1)) < 5e-3
 
 

@@ -108,7 +108,7 @@ def _check_single(kind, lookups, table, config, rng, lookup) -> Check:
     if kind == "area":
         theta = float(rng.uniform(0, np.pi))
         truth = validation.area_entry(tau, theta, moments=moments, order=config.area.order)
-        found = lookup.scaled_single(response, np.float32(tau), np.float32(theta))
+        found = lookup.scaled_single(response, np.float32(tau), theta_n=np.float32(theta))
         return Check(name, f"{where}, theta = {theta:.3f}", _error(found, truth), _limit(table, name, 2e-4))
     make = validation.point_entry if kind == "point" else validation.directional_entry
     truth = make(tau, moments=moments, order=config.order)
@@ -137,7 +137,7 @@ def _check_multiple(kind, lookups, table, config, rng, lookup) -> Check:
             node, weight = np.polynomial.legendre.leggauss(16)
             zonal = [i for i, (_, m) in enumerate(assemble.harmonics.half_index(order)) if m == 0]
             theta = np.arccos(node).astype(np.float32)
-            values = np.asarray(lookup.scaled_multiple(response, np.full(16, tau, np.float32), theta), dtype=np.float64)
+            values = np.asarray(lookup.scaled_multiple(response, np.full(16, tau, np.float32), theta_n=theta), dtype=np.float64)
             found, truth = weight / 2 @ values[:, zonal], truth / 4
     return Check(name, where, _error(found, truth), _limit(table, name, 5e-4))
 

@@ -194,7 +194,7 @@ def _nothing_to_do(scene, choices):
     return ()
 
 
-def group_size(level: int, cluster_size: int, largest: int = 8) -> int:
+def group_size(level: int, cluster_size: int, *, largest: int = 8) -> int:
     """Surfels that are evaluated together: as many as share a cluster of the transport table on this level."""
     return int(max(1, min(largest, cluster_size // 4**level)))
 

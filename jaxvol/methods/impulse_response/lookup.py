@@ -92,14 +92,14 @@ def _grid(tables, kind, *, moments, g, albedo, multiple, num_tau, num_angle):
         theta = pi / 2 * (1 - jnp.sign(v) * v * v)
         # The table is two-sided at pi/2, where both series hold the same value: any side will do.
         tau, theta = jnp.broadcast_arrays(tau[:, None], theta[None, :])
-        once = zonal_lookup.scaled_single(response, tau, theta)
+        once = zonal_lookup.scaled_single(response, tau, theta_n=theta)
     else:
         tau, theta = tau[:, None], None
         once = zonal_lookup.scaled_single(response, tau)
     if not multiple:
         return ResponseGrid(once, None, None, last, response.single_range[1])
     limit = response.multiple_range[1]
-    more = zonal_lookup.scaled_multiple(response, jnp.minimum(tau, limit), theta)
+    more = zonal_lookup.scaled_multiple(response, jnp.minimum(tau, limit), theta_n=theta)
     more = more * jnp.exp(response.kappa * jnp.minimum(tau, limit))[..., None]
     return ResponseGrid(once, more, response.kappa, last, limit)
 

@@ -1,6 +1,6 @@
 """Light probes: incident light on a grid as SH of order 3, and relighting from them (section 5, Fig. 11)."""
 
-from math import pi
+from math import pi, sqrt
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def radiance_from_irradiance(irradiance: Float[np.ndarray, "*b N 3"]) -> Float[n
 
 
 def _num_polar(num: int) -> int:
-    return round((num / 2) ** 0.5)
+    return round(sqrt(num / 2))
 
 
 def grid(bounds: ArrayLike, spacing: float) -> tuple[np.ndarray, np.ndarray, tuple[int, int, int]]:
