@@ -55,7 +55,7 @@ def body(shape, sigma_s, sigma_a, *, ior=None, density=None, inclusions=()):
     )  # fmt: skip
 
 
-def marble(shape, resolution=64):
+def marble(resolution=64):
     """A procedural density between 0.2 and 1 over the bounds of a body."""
     axes = [np.linspace(-0.5, 0.5, resolution)] * 3
     x, y, z = np.meshgrid(*axes, indexing="ij")
@@ -102,7 +102,7 @@ def figure6(size, resolution):
 
 def figure7(size, resolution):
     for name, side in (("bunny", 1.0), ("cow", -1.0)):
-        medium = body(solid(name), [40.0, 30.0, 20.0], [0.2, 0.5, 1.2], ior=1.3, density=marble(name))
+        medium = body(solid(name), [40.0, 30.0, 20.0], [0.2, 0.5, 1.2], ior=1.3, density=marble())
         yield name, shot(Scene(medium=medium, spot_lights=spot_light((1.4 * side, 0.9, 0.9))), camera(size), resolution)
 
 

@@ -77,6 +77,8 @@ def _report_job(result: rendering.Rendering, stopped: bool) -> None:
     if "error" in found:
         spent = f"{int(result.estimate.num_samples)} samples a pixel"
         _say(f"error {float(found['error']):.2%} (standard error of 8 x 8 blocks over the mean) with {spent}")
+    if not bool(found.get("converged", True)):
+        _say(f"warning: the solve did not converge, residual {float(np.max(found['residual'])):.1e}; allow more applications")
     if stopped:
         _say("stopped early; the same command goes on from here")
 

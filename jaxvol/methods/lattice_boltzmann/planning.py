@@ -65,7 +65,9 @@ def claims(scene: Scene) -> tuple[Claim, ...]:
     else:
         similar = "anisotropy by similarity: right in total only where light scatters often"
         found = [Claim(_SUM, similar if partial is None else f"{partial}; {similar}")]
-    if surfaces:
+    if not surfaces:
+        found.append(Claim(("volume_from_surface",)))  # exactly zero
+    else:
         found.append(
             Claim(
                 ("volume_from_surface",), "Lambertian part of the reflection only" if scene.mesh.specular is not None else one

@@ -47,9 +47,9 @@ def test_layers_are_claimed_and_books_balance(grey):
     estimate, plan = grey
     assert plan.num_channels == 1 and any("one spectrum" in reason for reason in plan.skipped)
     claimed = {claim.name for claim in lattice_boltzmann.claims(_scene())}
-    assert claimed == {"volume_from_light", "volume_from_volume", "volume_from_multiple"}
+    assert claimed == {"volume_from_light", "volume_from_volume", "volume_from_multiple", "volume_from_surface"}
     found = dict(items(estimate.mean))
-    assert set(found) == claimed | {"volume_from_surface"}
+    assert set(found) == claimed
     assert not np.any(found["volume_from_surface"]) and all(np.isfinite(v).all() for v in found.values())
     diagnostics = estimate.diagnostics
     assert bool(diagnostics["converged"]) and float(diagnostics["residual"].max()) < 2e-4
@@ -81,7 +81,7 @@ def test_power_scales_the_picture(grey):
 
 
 def test_anisotropic_media_claim_only_the_sum():
-    (claim,) = lattice_boltzmann.claims(_scene(g=jnp.float32(0.5)))
+    claim, _ = lattice_boltzmann.claims(_scene(g=jnp.float32(0.5)))
     assert claim.layers == ("volume_from_light", "volume_from_volume", "volume_from_multiple") and "similarity" in claim.partial
 
 
@@ -234,7 +234,7 @@ def test_slab_reflectance_and_transmittance(tau, mu0, reflectance, count, width)
 @pytest.mark.slow
 def test_slab_under_lambertian_light():
     """T5: T(1) = .55341 of a slab of albedo 1 under diffuse light from one side."""
-    tau, width, count = 1.0, 12.0, 8
+    tau, width, count = 1.0, 8.0, 16  # grazing light is stopped in the first voxels: they want to be thin
     medium = Medium(jnp.asarray([[0, 0, 0], [width, width, tau]], jnp.float32), jnp.ones(3), jnp.zeros(3), jnp.float32(0))
     nodes, weights = np.polynomial.legendre.leggauss(6)
     mu, phi = (a.ravel() for a in np.meshgrid(0.5 * (nodes + 1), (np.arange(6) + 0.5) / 3 * np.pi, indexing="ij"))
@@ -243,7 +243,7 @@ def test_slab_under_lambertian_light():
     direction = np.stack([r * np.cos(phi), r * np.sin(phi), mu], 1)
     suns = DirectionalLights(jnp.asarray(direction, jnp.float32), jnp.asarray(np.repeat((flux / mu)[:, None], 3, 1), jnp.float32))
     scene = Scene(medium=medium, directional_lights=suns)
-    options = {"rays_per_voxel": 0.25, "view_step": 0.25, "corrections": 4}  # two corrections leave -3.3 % in R
+    options = {"rays_per_voxel": 0.25, "view_step": 0.25, "corrections": 2}
     plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), **options)
     light = lattice_boltzmann.illuminate(scene, plan)
     straight = float(np.sum(flux * np.exp(-tau / mu)))
