@@ -86,7 +86,7 @@ def _solve(k: np.ndarray, m: int, diagonal: np.ndarray, tail: np.ndarray, source
 
 
 def _amplitudes(k, m, moments, albedo, source_bands, order, first, last) -> np.ndarray:
-    """A^m_{l k'}(k): `[order, sources, nodes]`, bands below m zero; bounces first..last, last = None for all, over albedo^first."""
+    """A^m_{l k'}(k): `[order, sources, nodes]`, zero below m; bounces first..last (None = all) over albedo^first."""
     bands = max(moments.size, order, max(source_bands) + 1, m + 1) - m
     chi = np.zeros(bands)
     chi[: max(moments.size - m, 0)] = moments[m:]

@@ -32,9 +32,23 @@ def optimal_linear(half: np.ndarray) -> np.ndarray:
     return np.arctan2(half[..., 2], half[..., 1])
 
 
+def _meridian(order: int) -> np.ndarray:
+    """y_lm on the meridian as a Fourier series in psi: coefficients of cos k psi, then of sin k psi, `[2 order, half]`.
+
+    One small matrix product instead of the unrolled recursion, which XLA compiles for minutes inside a solver.
+    """
+    psi = 2 * pi * np.arange(4 * order) / (4 * order)
+    polynomials = harmonics.normalised_legendre(np.cos(psi), order)
+    values = np.stack([polynomials[band, m] * np.sin(psi) ** m for band, m in harmonics.half_index(order)], axis=-1)
+    waves = np.exp(1j * np.outer(np.arange(order), psi)) @ values / (2 * order)
+    waves[0] /= 2
+    return np.concatenate([waves.real, waves.imag])
+
+
 def _residual(psi, half, weight, order):
     """Weighted L_lm - sqrt(4pi/(2l+1)) f_l y_lm(psi), a vector over (l, m >= 0)."""
-    basis = harmonics.evaluate_half(jnp.cos(psi), jnp.sin(psi), order)
+    phases = np.arange(order) * psi
+    basis = jnp.concatenate([jnp.cos(phases), jnp.sin(phases)]) @ _meridian(order)
     bands = np.array([band for band, _ in harmonics.half_index(order)])
     zonal = jax.ops.segment_sum(half * basis, bands, num_segments=order)  # without its factor sqrt(4pi/(2l+1))
     scale = (harmonics.rotation_norm(order) ** 2)[bands]

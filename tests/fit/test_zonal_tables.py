@@ -60,7 +60,7 @@ def test_band_zero_is_the_closed_form():
     tau = np.array([0.05, 1.0, 5.0])
     fluence = np.sqrt(4 * np.pi) * zonal_tables.unscale_point(zonal_tables.point_table(tau, order=1), tau)[:, 0]
     np.testing.assert_allclose(fluence, green.fluence_bounce(tau, 1), rtol=1e-11)
-    direct = [quad(lambda s: np.exp(-s * t) / s * np.log((s + 1) / (s - 1)), 1, np.inf)[0] / t for t in tau]
+    direct = [quad(lambda s, t: np.exp(-s * t) / s * np.log((s + 1) / (s - 1)), 1, np.inf, args=(t,))[0] / t for t in tau]
     np.testing.assert_allclose(fluence, direct, rtol=1e-6)
 
 
