@@ -5,8 +5,9 @@ Irradiance E at x gathers reflected radiance albedo E(y) / pi of patches y throu
     K(x, y) = V(x, y) { cos+_x cos+_y e^-tau / d^2  +  response of the area table }         1/length^2
 
 whose second part also knows patches beside and behind x (back-scattering). One vertex is drawn by one of three techniques
-and weighted by the density of all three (balance heuristic): a cosine-distributed ray, which fits the first part; a probe
-along the normal through a point at distance r ~ sigma e^{-sigma r} in the plane of x, which fits the 1/d of back-scattering
+and weighted by the density of all three (balance heuristic): a ray, cosine-distributed as fits the first part, a quarter
+of them uniform over the hemisphere for scattered light from walls that meet the surface of x; a probe along the normal
+through a point at distance r ~ sigma e^{-sigma r} in the plane of x, which fits the 1/d of back-scattering
 (specification 8); a point uniform over the area of all faces.
 """
 
@@ -27,6 +28,7 @@ from jaxvol.types import Mesh
 
 _STREAM = sampling.stream("impulse_response.surface_paths")
 _LIFT = 2.0**-16  # offset of rays, relative to coordinates
+_UNIFORM = 0.25  # share of uniform directions among rays, where light is scattered
 
 
 class Faces(eqx.Module):
@@ -100,7 +102,10 @@ def propose(
     v = sampling.uniforms(seed, _STREAM, item, 2 * depth + 1, sample)
     technique = (u[0] > shares[0]).astype(jnp.int32) + (u[0] > shares[0] + shares[1]).astype(jnp.int32)
     start = lifted(position, normal, faces.scale)
-    cosine_ray = sampling.sample_cosine_hemisphere(u[1], u[2], normal)
+    ray = sampling.sample_cosine_hemisphere(u[1], u[2], normal)
+    if shares[0] < 1:
+        uniform = sampling.direction_about(normal, u[1], jnp.sqrt((1 - u[1]) * (1 + u[1])), u[2])
+        ray = jnp.where((v[3] < _UNIFORM)[:, None], uniform, ray)
     radius = sampling.sample_exponential(u[1], probe_sigma)
     s, t = sampling.orthonormal_basis(normal)
     sine, cosine = sampling.sin_cos_turn(u[2])
@@ -112,7 +117,7 @@ def propose(
     return Proposal(
         technique=technique,
         origin=jnp.where(probing, above, start),
-        direction=jnp.where(probing, -normal, cosine_ray),
+        direction=jnp.where(probing, -normal, ray),
         t_max=jnp.where(technique == 2, 0.0, jnp.inf),
         face=face,
         point=a + w1[:, None] * (b - a) + w2[:, None] * (c - a),
@@ -186,7 +191,11 @@ def transport(
     cos_x = jnp.maximum(dot(normal, arrival.direction), 0.0)
     cos_y = jnp.maximum(-dot(arrival.normal, arrival.direction), 0.0)
     geometry = jnp.where(visible, cos_x * cos_y / (arrival.distance * arrival.distance), 0.0)
-    pdf = shares[0] / pi * geometry
+    pdf = geometry / pi
+    if shares[0] < 1:
+        front = visible & (cos_x > 0)
+        even = jnp.where(front, cos_y / (arrival.distance * arrival.distance), 0.0) / (2 * pi)
+        pdf = shares[0] * ((1 - _UNIFORM) * pdf + _UNIFORM * even)
     if shares[1] > 0:
         upward = dot(arrival.normal, normal)
         below = dot(arrival.position - arrival.plumb[0], normal) < 0
