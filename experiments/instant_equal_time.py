@@ -1,6 +1,6 @@
 """Equal-time comparison with Mitsuba 3's volpath: CPU seconds against relMSE (CSV and a figure).
 
-Both render the whole picture (single scattering included, ours from 12 stratified points per eye ray), on one core.
+Both render the whole picture (single scattering included, ours by quadrature along one eye ray a pixel), on one core.
 relMSE against a reference R with its own noise removed: mean((I - A)(I - B) / (R^2 + 0.01 mean(R)^2)) with two
 independent halves A, B of the reference. Needs mitsuba (extra "peer") and, for llvm_ad_rgb, DRJIT_LIBLLVM_PATH.
 Usage: taskset -c 0 python experiments/instant_equal_time.py cube|cube_g|plume [--size 64] [--variant llvm_ad_rgb].
@@ -19,18 +19,18 @@ import numpy as np
 from instant_common import SCENES, figure, out_folder, pictures, square_camera, write_csv
 
 from jaxvol import lights as primary
-from jaxvol import media, sampling
+from jaxvol import media
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering import compensation, rendering, stages
+from jaxvol.methods.instant_multiple_scattering import compensation, receivers, rendering
 from jaxvol.methods.instant_multiple_scattering.receivers import Points
 
-STRATA = 12  # points per eye ray for single scattering
+NODES = 20  # points per eye ray for single scattering
 SPP = (16, 64, 256)
 OURS = {
     "full resolution": {},
     "low resolution": {"upsample": 4},
 }
-PATHS = (1024, 4096)
+PATHS = (512, 4096)
 
 
 def mitsuba_scene(scene, size):
@@ -73,36 +73,32 @@ def mitsuba_scene(scene, size):
 
 
 @partial(jax.jit, static_argnames="plan")
-def single_scattering(scene, mip, camera, index, seed, stratum, *, plan):
-    """Light scattered once: one equi-angular or transmittance-sampled point per eye ray, in the given stratum."""
-    context = rendering.Context(scene, None, None, mip, plan, seed)
+def single_scattering(scene, camera, index, seed, *, plan):
+    """Light scattered once: Gauss-Legendre quadrature along one jittered eye ray per pixel."""
+    context = rendering.Context(scene, None, None, None, plan, seed)
     xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
-    coverage = jnp.float32(1.0)
-    if plan.jitter:
-        xy, coverage = rendering.choose_in_pixel(scene, camera, xy, index, seed + 7919 * stratum.astype(jnp.uint32))
-    else:
-        xy = xy + 0.5
-    origin, direction, t, _, _ = rendering.cast(context, camera, xy, index)
-    segments = stages.segments_of(context, origin, direction, t)
-    u = sampling.uniforms(context.seed, sampling.stream("experiment.single"), index, 0)
-    inside = (stratum + u[0]) / STRATA
-    if scene.medium.density is None:
-        t, pdf = sampling.sample_equiangular(
-            inside, origin, direction, segments.t0, segments.t1, scene.point_lights.position[0]
-        )
-        points = origin + t[:, None] * direction
-        weight = jnp.exp(-(t - segments.t0)[:, None] * media.sigma_t(scene.medium)) / jnp.maximum(pdf, 1e-30)[:, None]
-        points = Points(points, -direction, jnp.broadcast_to(scene.medium.sigma_s, points.shape), None)
-    else:
-        points, weight = stages.eye_vertices(context, segments, inside)
-        density = media.density(scene.medium, points.position)
-        total = jnp.where(density > 0, 1.0, 0.0)
-        points = Points(points.position, points.outgoing, points.scattering * total[:, None], None)
-    sample = primary.sample_light(scene, points.position, u[1], u[2], u[3])
-    value = compensation.direct_light(
-        scene, points, sample, None, isotropic=context.plan.isotropic, num_steps=max(context.plan.eye_steps, 1)
-    )
-    return jnp.where((segments.t1 > segments.t0)[:, None], weight * value, 0.0) * jnp.reshape(coverage, (-1, 1))
+    xy, coverage = rendering.choose_in_pixel(scene, camera, xy, index, seed)
+    origin, direction, _, _, _ = rendering.cast(context, camera, xy, index)
+    t0, t1 = media.box_interval(scene.medium.bounds, origin, direction)
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    steps = max(plan.eye_steps, 1)
+    u = jnp.full(index.shape, 0.5, jnp.float32)
+
+    def body(total, node):
+        x, w = node
+        t = t0 + (t1 - t0) * (0.5 + 0.5 * x)
+        position = origin + t[:, None] * direction
+        density = media.density(scene.medium, position)
+        points = Points(position, -direction, density[:, None] * scene.medium.sigma_s, None)
+        sample = primary.sample_light(scene, position, u, u, u)
+        value = compensation.direct_light(scene, points, sample, None, isotropic=plan.isotropic, num_steps=steps)
+        before = receivers.column_between(scene.medium, origin + t0[:, None] * direction, position, num_steps=steps)
+        tau = jnp.exp(-before[:, None] * media.sigma_t(scene.medium))
+        return total + tau * value * (0.5 * w * (t1 - t0))[:, None], None
+
+    zero = jnp.zeros(origin.shape, jnp.float32)
+    total, _ = jax.lax.scan(body, zero, (jnp.float32(nodes), jnp.float32(weights)))
+    return jnp.where((t1 > t0)[:, None], total * coverage[:, None], 0.0)
 
 
 def ours(scene, camera, plan, seed):
@@ -111,19 +107,11 @@ def ours(scene, camera, plan, seed):
     images, counts = rendering.render_set(scene, camera, plan, seed=seed, sizes=SIZES.setdefault(plan.num_paths, {}))
     total = sum(images.values())
     index = jnp.arange(len(total), dtype=jnp.uint32)
-    for k in range(STRATA):
-        single = single_scattering(scene, mip_of(scene, plan), camera, index, jnp.uint32(seed), jnp.float32(k), plan=plan)
-        total = total + np.asarray(single) / STRATA
+    total = total + np.asarray(single_scattering(scene, camera, index, jnp.uint32(seed), plan=plan))
     return total, time.process_time() - start, counts
 
 
 SIZES: dict = {}
-
-
-def mip_of(scene, plan):
-    if scene.medium.density is None:
-        return None
-    return jnp.asarray(compensation.coarse_density(scene.medium.density, block=plan.mip_block))
 
 
 def relmse(image, a, b):
