@@ -245,7 +245,9 @@ def test_slab_under_lambertian_light():
     flux = np.repeat(0.5 * weights, 6) * 2 * mu / 6  # of a unit irradiance
     r = np.sqrt(1 - mu * mu)
     direction = np.stack([r * np.cos(phi), r * np.sin(phi), mu], 1)
-    suns = DirectionalLights(jnp.asarray(direction, jnp.float32), jnp.asarray(np.repeat((flux / mu)[:, None], 3, 1), jnp.float32))
+    suns = DirectionalLights(
+        jnp.asarray(direction, jnp.float32), jnp.asarray(np.repeat((flux / mu)[:, None], 3, 1), jnp.float32)
+    )
     scene = Scene(medium=medium, directional_lights=suns)
     options = {"rays_per_voxel": 0.25, "view_step": 0.25, "corrections": 2}
     plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), **options)
