@@ -90,7 +90,7 @@ def figure_10():
         for plot, table, kind in ((plots[0, column], point, "point"), (plots[1, column], below, "directional")):
             for band in range(11):
                 plot.semilogx(tau, table[:, band] / table[:, 0], label=f"l = {band}")
-            plot.set(title=f"{kind}, {n} scattering{'s' * (n > 1)}", ylim=(-0.6, 1.7), xlabel="tau")
+            plot.set(title=f"{kind}, {n} scattering{'s' * (n > 1)}", ylim=(-1.1, 1.7), xlabel="tau")
             rows += [{"emitter": kind, "bounce": n, "tau": t, **{f"L_{b}": v for b, v in enumerate(line)}}
                      for t, line in zip(tau[::8], table[::8], strict=True)]  # fmt: skip
     plots[0, 0].legend(fontsize=6, ncols=2)

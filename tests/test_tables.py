@@ -178,7 +178,8 @@ def test_small_set_is_accurate_enough_to_verify(small):
 
 
 def test_verify_finds_a_wrong_table(small):
-    arrays = {name: value for name, value in small.arrays.items() if name.startswith("point.")}
+    kept = ("point.single", "point.single_range", "point.compact", "point.compact_range")
+    arrays = {name: small.arrays[name] for name in kept}
     arrays["point.single"] = arrays["point.single"] * 1.001
     config = {**small.metadata["config"], "emitters": ["point"], "multiple": None}
     wrong = tables.seal(arrays, {**small.metadata, "config": config})
@@ -206,7 +207,10 @@ def test_single_scattering_within_1e6(lookups):
     response = zonal_lookup.medium_response(lookups, "area")
     theta = np.full(80, 1.1, np.float32)
     truth = zonal_tables.area_table(tau, 1.1)[:, 0]
-    assert np.max(np.abs(zonal_lookup.scaled_single(response, tau.astype(np.float32), theta_n=theta) - truth) / truth[:, :1]) < 1e-4
+    assert (
+        np.max(np.abs(zonal_lookup.scaled_single(response, tau.astype(np.float32), theta_n=theta) - truth) / truth[:, :1])
+        < 1e-4
+    )
 
 
 def test_multiple_scattering_of_the_default_set(lookups):

@@ -268,7 +268,7 @@ def join(parts: dict[str, dict[str, np.ndarray]], config: TableConfig) -> dict[s
 def estimate_errors(arrays: dict[str, np.ndarray], config: TableConfig, *, num: int = 24) -> dict[str, float]:
     """Largest error of each table at random points between the nodes, relative to band 0 (area: its maximum over angles).
 
-    Multiple scattering is judged at tau <= 10: farther out at small albedo, where it has lost e^-tau, tables are 10 times worse.
+    Multiple scattering is judged at tau <= 10: farther out, at small albedo, tables are 10 times worse.
     Evaluated in float64 by the jitted lookup; truth is a fresh quadrature (single) or solution (multiple) at those points.
     """
     rng = np.random.default_rng(config.seed)

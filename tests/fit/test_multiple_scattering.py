@@ -100,9 +100,7 @@ def test_energy_and_mean_square_of_bounces(g, n):
 def test_energy_and_mean_square_of_the_sum():
     """T2a: <r^2> = 2 / ((1 - c)(1 - c g)); c = 0.8, g = 0.6: 19.231."""
     moments, c = wavenumber.effective_moments(0.6), 0.8
-    energy, square = radial_integrals(
-        lambda r: np.exp(-r) / r**2 + c * fluence(r, moments=moments, albedo=c, first=1), 120.0
-    )
+    energy, square = radial_integrals(lambda r: np.exp(-r) / r**2 + c * fluence(r, moments=moments, albedo=c, first=1), 120.0)
     assert abs(energy * (1 - c) / (4 * np.pi) - 1) < 1e-5
     assert abs(square / (2 / ((1 - c) * (1 - c * 0.6))) - 1) < 1e-5
 
@@ -129,9 +127,7 @@ def test_area_bounces_by_source_moments():
     """Projected on y_km of the normal, the exact area table is the wavenumber solution's source moment."""
     tau, bands, order = np.array([0.05, 1.0, 6.0]), (0, 1, 2, 4), 4
     moments = wavenumber.effective_moments(0.5)
-    response = wavenumber.moment_responses(
-        tau, moments=moments, albedo=1.0, source_bands=bands, order=order, first=1, last=1
-    )
+    response = wavenumber.moment_responses(tau, moments=moments, albedo=1.0, source_bands=bands, order=order, first=1, last=1)
     x, w = np.polynomial.legendre.leggauss(16)
     theta = np.concatenate([(x + 1) * np.pi / 4, np.pi / 2 + (x + 1) * np.pi / 4])
     weight = np.concatenate([w, w]) * np.pi / 4 * np.sin(theta)
