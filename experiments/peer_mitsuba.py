@@ -53,7 +53,7 @@ TWO = (*ONE, "surface_from_surface", "surface_from_volume", "volume_from_surface
 SUMS = {"one": (ONE, 2), "two": (TWO, 3), "total": (NAMES, -1)}  # our layers, Mitsuba's max_depth
 SYSTEMATIC = 2e-4  # relative difference below which nothing is told
 SIGNIFICANCE = 0.01  # of the whole picture
-LEAST_LLVM = 16  # 14 and 15 abort: "Cannot select: fmaximum"
+LEAST_LLVM = 19  # 19 and 22 work, 14 and 15 abort ("Cannot select: fmaximum")
 
 
 @dataclass
