@@ -67,7 +67,7 @@ def positions(low: np.ndarray, step: np.ndarray, shape: tuple[int, int, int]) ->
 def relight(probes: Probes, points: ArrayLike, normals: ArrayLike) -> Float[np.ndarray, "N 3"]:
     """Irradiance at points [N, 3] facing unit normals, from trilinearly interpolated probes (the nearest beyond the grid).
 
-    Order 3 keeps a Lambertian surface's response to about 3 % for distant light.
+    Order 3 leaks: facing a single small lamp it gives 1.06 of the truth, edge-on 0.09 of that instead of 0.
     """
     shape = np.array(probes.radiance.shape[:3])
     x = np.clip((np.asarray(points, np.float64) - probes.low) / probes.step, 0, shape - 1)
