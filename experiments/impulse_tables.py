@@ -208,8 +208,9 @@ def green_function():
             partial[bounces] = 1 - summed / exact
             if albedo == 0.9:
                 right.loglog(tau, np.maximum(partial[bounces], 1e-12), label=f"{bounces} bounces")
-        rows += [{"albedo": albedo, "tau": t, "fluence": e, "error": s / e - 1, **{f"missing_{b}": p[i] for b, p in partial.items()}}
-                 for i, (t, e, s) in enumerate(zip(tau, exact, solved, strict=True))]  # fmt: skip
+        for i, (t, e, s) in enumerate(zip(tau, exact, solved, strict=True)):
+            missing = {f"missing_{bounces}": share[i] for bounces, share in partial.items()}
+            rows.append({"albedo": albedo, "tau": t, "fluence": e, "error": s / e - 1, **missing})
     left.set(xlabel="tau", title="infinite sum against Case's solution, relative error")
     right.set(xlabel="tau", title="share of the fluence that K bounces miss, albedo 0.9", ylim=(1e-6, 2))
     left.legend()

@@ -23,9 +23,7 @@ def fit(
         print(f"sigma_ratio: largest error of an exponent {worst:.1e}")
     if "compact" in results:
         for row in results["compact"]:
-            print(
-                f"compact, {row['num']} coefficients: relative error {row['interpolation']:.1e}, fitted {row['least_squares']:.1e}"
-            )
+            print(f"compact, {row['num']} coefficients: error {row['interpolation']:.1e}, fitted {row['least_squares']:.1e}")
     if "axis" in results:
         for name in dict.fromkeys(row["axis"] for row in results["axis"]):
             worst = max(row["irradiance"] for row in results["axis"] if row["axis"] == name)

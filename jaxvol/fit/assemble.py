@@ -185,7 +185,7 @@ def _multiple(kind: str, tau, moments, albedo: float, config: TableConfig, *, ka
         table = wavenumber.point_table(tau, moments=moments, albedo=albedo, order=config.order, kappa=kappa)[:, None]
     else:
         table = half_space.directional_table(
-            tau, moments=moments, albedo=albedo, order=config.order, num_streams=half_space.streams_for(moments)
+            tau, moments=moments, albedo=albedo, order=config.order, num_streams=half_space.streams_for(moments), num_nodes=64
         )[:, None]
     return _to_ratios(table)
 
@@ -268,7 +268,7 @@ def join(parts: dict[str, dict[str, np.ndarray]], config: TableConfig) -> dict[s
 def estimate_errors(arrays: dict[str, np.ndarray], config: TableConfig, *, num: int = 24) -> dict[str, float]:
     """Largest error of each table at random points between the nodes, relative to band 0 (area: its maximum over angles).
 
-    Multiple scattering is judged at tau <= 10: farther out, at small albedo, tables are 10 times worse.
+    Multiple scattering is judged at tau <= 10; farther out, at small albedo, tables are 10 times worse.
     Evaluated in float64 by the jitted lookup; truth is a fresh quadrature (single) or solution (multiple) at those points.
     """
     rng = np.random.default_rng(config.seed)
@@ -301,7 +301,7 @@ def _single_error(tables, kind, config, rng, num) -> float:
         return _relative(np.asarray(_single(response, tau)), make(tau, order=config.order))
     theta = rng.uniform(0, np.pi, 6)
     truth = zonal_tables.area_table(tau, theta, order=config.area.order)
-    found = np.asarray(_single(response, tau[:, None], np.broadcast_to(theta, (num, 6))))
+    found = np.asarray(_single(response, tau[:, None], theta_n=np.broadcast_to(theta, (num, 6))))
     return _relative(found, truth)
 
 
@@ -318,7 +318,7 @@ def _multiple_error(tables, kind, config, rng, num) -> float:
         if kind == "area":
             bands, order = config.multiple.area.source_bands, config.area.order
             truth = area_response(tau, theta, moments=moments, albedo=albedo, order=order, source_bands=bands + 6)
-            found = _many(response, tau[:, None], np.broadcast_to(theta, (tau.size, theta.size)))
+            found = _many(response, tau[:, None], theta_n=np.broadcast_to(theta, (tau.size, theta.size)))
         else:
             truth = compact.from_ratios(_multiple(kind, tau, moments, albedo, config)[:, 0])
             found = _many(response, tau)
