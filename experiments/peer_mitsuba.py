@@ -18,6 +18,7 @@ a systematic difference of 2e-4 (rays that Mitsuba starts off its surfaces, grow
 
 Times are warm: CPU seconds of the process, both on all cores, compilation apart. With relMSE from the variances of the
 two totals, which fall as 1 / time, the ratio of times to equal error is the ratio of the products of time and relMSE.
+Our lanes idle while the longest paths of a batch end: for times choose samples times pixels far above `num_lanes`.
 """
 
 import argparse
