@@ -231,13 +231,9 @@ def test_slab_reflectance_and_transmittance(tau, mu0, reflectance, count, width)
     assert down + np.exp(-tau / mu0) == pytest.approx(1 - reflectance, rel=0.03)
 
 
-@pytest.mark.slow
-def test_slab_under_lambertian_light():
-    """T5: T(1) = .55341 of a slab of albedo 1 under diffuse light from one side, T within 3 %.
-
-    R misses 3 % (measured -3.3 %, also with more corrections): grazing light is stopped inside the first voxel, whose
-    emission the view pass spreads evenly.
-    """
+@pytest.fixture(scope="module")
+def diffusely_lit_slab():
+    """T5: transmittance and reflectance of a slab of optical thickness 1 and albedo 1 under diffuse light from one side."""
     tau, width, count = 1.0, 12.0, 8
     medium = Medium(jnp.asarray([[0, 0, 0], [width, width, tau]], jnp.float32), jnp.ones(3), jnp.zeros(3), jnp.float32(0))
     nodes, weights = np.polynomial.legendre.leggauss(6)
@@ -254,5 +250,15 @@ def test_slab_under_lambertian_light():
     light = lattice_boltzmann.illuminate(scene, plan)
     straight = float(np.sum(flux * np.exp(-tau / mu)))
     down = _exitance(scene, plan, light, tau, width, 1) + straight
-    assert down == pytest.approx(0.55341, rel=0.03)
-    assert _exitance(scene, plan, light, tau, width, 0) == pytest.approx(1 - 0.55341, rel=0.04)
+    return down, _exitance(scene, plan, light, tau, width, 0)
+
+
+@pytest.mark.slow
+def test_diffuse_light_through_a_slab(diffusely_lit_slab):
+    assert diffusely_lit_slab[0] == pytest.approx(0.55341, rel=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(reason="measured -3.3 %, also with more corrections: light near the lit face is the lattice's worst")
+def test_diffuse_light_back_from_a_slab(diffusely_lit_slab):
+    assert diffusely_lit_slab[1] == pytest.approx(1 - 0.55341, rel=0.03)
