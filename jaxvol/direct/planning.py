@@ -52,8 +52,8 @@ def plan(
     num_area_points: int = 2,
     num_area_steps: int = 4,
     num_emitter_steps: int = 8,
-    num_environment_samples: int = 12,
-    num_environment_steps: int = 32,
+    num_environment_samples: int | None = None,
+    num_environment_steps: int | None = None,
     num_bsdf_samples: int | None = None,
     num_phase_steps: int | None = None,
     num_light_steps: int | None = None,
@@ -91,11 +91,17 @@ def plan(
     by_value = specialize == "values"
     emission, surface, volume, skipped = _layers(scene, by_value)
     across = 0 if scene.medium is None else extinction.num_voxels_across(scene.medium)
+    # A map with a sun in it needs more directions than a sky of one radiance; without a grid they cost little.
+    is_map = scene.environment is not None and scene.environment.radiance.shape[:2] != (1, 1)
+    if num_environment_samples is None:
+        num_environment_samples = 40 if is_map else 12
+    if num_environment_steps is None:
+        num_environment_steps = 64 if is_map and not across else 32
     if num_bsdf_samples is None:
         num_bsdf_samples = _default_bsdf_samples(scene)
     if num_phase_steps is None:
         # Measured on clouds with g = .8: what light gets through matters more than the phase function's peak.
-        peaked = scene.environment is not None and volume and (not by_value or _sharpest(scene.medium) > 0.85)
+        peaked = scene.environment is not None and volume and (not by_value or _sharpest(scene.medium) > 0.9)
         num_phase_steps = 8 if peaked else 0
     if scene.environment is not None and volume and num_environment_steps + num_phase_steps == 0:
         raise ValueError("num_environment_steps and num_phase_steps must not both be 0 in a scene with an environment")
