@@ -69,7 +69,7 @@ def test_reflecting_plane_lights_itself_through_the_fog(c):
     distance = np.sqrt(1 + np.square(RADII))
     truth = np.exp(-distance) / distance**3 + once + rest
     scene = open_plane(c, albedo=0.5)
-    estimate = impulse_response.irradiance(scene, *receivers(), samples=400, max_bounces=5)
+    estimate = impulse_response.irradiance(scene, *receivers(), samples=800, max_bounces=5)
     total = np.asarray(layers.total(estimate.mean))[:, 0]
     assert np.abs(total - truth).sum() / truth.sum() < 0.03
     assert np.all(found(estimate, "surface_from_surface") == 0)  # a plane does not see itself
@@ -96,26 +96,26 @@ def inside(scene, num=6):
 def test_integrating_sphere():
     """E = E_direct (1 + a + a^2 + ...) everywhere inside a white sphere, order by order."""
     scene = sphere(0.6)
-    estimate = impulse_response.irradiance(scene, *inside(scene), samples=64, max_bounces=3)
+    estimate = impulse_response.irradiance(scene, *inside(scene), samples=2048, max_bounces=3)
     direct = found(estimate, "surface_from_light")
     np.testing.assert_allclose(found(estimate, "surface_from_surface"), 0.6 * direct, rtol=0.02)
-    np.testing.assert_allclose(found(estimate, "surface_from_multiple"), (0.36 + 0.216) * direct, rtol=0.05)
+    np.testing.assert_allclose(found(estimate, "surface_from_multiple"), (0.36 + 0.216) * direct, rtol=0.06)
     assert "surface-only" in " ".join(impulse_response.plan(scene, None).skipped)
 
 
 def test_attenuated_only():
     """Absorption and out-scattering alone: the light of each chord loses e^-tau."""
     scene = sphere(0.6, density=1.0, bounds=[[-2, -2, -2], [2, 2, 2]], scattering=0.5, absorption=0.5)
-    dim = impulse_response.irradiance(scene, *inside(scene), samples=64, max_bounces=1, scattering="attenuated")
+    dim = impulse_response.irradiance(scene, *inside(scene), samples=4096, max_bounces=1, scattering="attenuated")
     points, normals = inside(scene)
-    clear = impulse_response.irradiance(scene, points, normals, samples=64, max_bounces=1, scattering="surface")
+    clear = impulse_response.irradiance(scene, points, normals, samples=16, max_bounces=1, scattering="surface")
     radius = np.linalg.norm(points, axis=1)
     np.testing.assert_allclose(
         found(dim, "surface_from_light"), np.exp(-radius) * found(clear, "surface_from_light"), rtol=1e-4
     )
     # Chords of a unit sphere under a cosine lobe have the density l / 2 on [0, 2].
     chord = np.exp(-radius) * (1 - 3 * np.exp(-2)) / 2
-    np.testing.assert_allclose(found(dim, "surface_from_surface"), chord * found(clear, "surface_from_surface"), rtol=0.12)
+    np.testing.assert_allclose(found(dim, "surface_from_surface"), chord * found(clear, "surface_from_surface"), rtol=0.04)
     assert np.all(found(dim, "surface_from_volume") == 0)
 
 
@@ -148,7 +148,9 @@ def test_claims_say_what_is_missed():
     spot = SpotLights(jnp.zeros((1, 3)), jnp.array([[0, 0, -1.0]]), jnp.ones((1, 3)), jnp.ones(1), jnp.ones(1))
     partial = [claim.partial for claim in impulse_response.claims(open_plane(0.9, spot_lights=spot))]
     assert partial[:2] == [None, None] and "cone" in partial[2]
-    box = make_scene({"shapes": [{"mesh": "builtin:box"}], "medium": {"density": 1.0, "scattering": 1.0}}).scene
+    box = make_scene(
+        {"shapes": [{"mesh": "builtin:box"}], "medium": {"density": 1.0, "bounds": [[-1, 0, -1], [1, 2, 1]], "scattering": 1.0}}
+    ).scene
     assert "occluders" in impulse_response.claims(box)[2].partial
 
 
