@@ -100,9 +100,9 @@ def plan(
     if num_bsdf_samples is None:
         num_bsdf_samples = _default_bsdf_samples(scene)
     if num_phase_steps is None:
-        # Measured on clouds with g = .8: what light gets through matters more than the phase function's peak.
-        peaked = scene.environment is not None and volume and (not by_value or _sharpest(scene.medium) > 0.9)
-        num_phase_steps = 8 if peaked else 0
+        # Thick clouds want directions of the sky, thin ones with a peaked phase function (g = .85) directions of the latter.
+        peaked = scene.environment is not None and volume and (not by_value or _sharpest(scene.medium) > 0.6)
+        num_phase_steps = 24 if peaked else 0
     if scene.environment is not None and volume and num_environment_steps + num_phase_steps == 0:
         raise ValueError("num_environment_steps and num_phase_steps must not both be 0 in a scene with an environment")
     if scene.environment is not None and surface and num_environment_samples + num_bsdf_samples == 0:
