@@ -18,7 +18,7 @@ from math import pi
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxvol import media, zonal_lookup
 from jaxvol.types import Medium
@@ -178,9 +178,3 @@ def directional_source(
             factor = albedo[channel] * albedo[channel] * jnp.exp(-grid.kappa * t)
             more.append(factor[..., None] * _interpolate(grid.multiple, nodes))
     return jnp.stack(once, axis=-2), jnp.stack(more, axis=-2) if more else None
-
-
-def num_outside(responses: Responses, tau: Float[Array, "*b 3"]) -> Int[Array, ""]:
-    """How many queries lie beyond the tables' tau, where the responses are continued as exponentials."""
-    grid = responses.point[0]
-    return jnp.sum(jnp.max(tau, axis=-1) > grid.multiple_max)
