@@ -52,9 +52,22 @@ def connect(scene, sensor, settings, lanes, casts, arrival, throughput, surface,
     if scene.mesh is not None:
         off = ray_casting.offset_origin(position, arrival.normal, found.direction, scale=ray_casting.scene_scale(scene.mesh))
         origin = jnp.where(arrival.on_surface[:, None], off, origin)
+    travel, distance = aim(found, origin)
     active = active & (jnp.max(contribution, axis=-1) > 0)
     never = jnp.zeros_like(active)
-    return Shadow(origin, found.direction, found.distance * _NEAR, contribution, group, active, never, lanes.event)
+    return Shadow(origin, travel, distance, contribution, group, active, never, lanes.event)
+
+
+def aim(found, origin):
+    """Direction and length of the shadow ray from `origin`, which may lie off the point that the light was sampled for.
+
+    On large surfaces the offset exceeds the margin before the light's own surface, which would then shadow itself.
+    """
+    delta = found.position - origin
+    distance = jnp.sqrt(jnp.maximum(sampling.dot(delta, delta), 1e-20))
+    finite = jnp.isfinite(found.distance)
+    travel = jnp.where(finite[:, None], delta / distance[:, None], found.direction)
+    return travel, jnp.where(finite, distance * _NEAR, jnp.inf)
 
 
 def nearby_lights(scene: Scene) -> Scene:

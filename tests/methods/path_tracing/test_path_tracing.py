@@ -168,6 +168,23 @@ def test_lambertian_floor_under_a_point_light():
         assert name == "surface_from_light" or np.all(np.asarray(image) == 0)
 
 
+def test_a_lamp_above_a_large_floor_does_not_shadow_itself():
+    """Offsets of ray origins grow with the mesh; the shadow ray still ends short of the lamp. Disc formula's centre."""
+    half = 0.05
+    lamp = np.array([[-half, 1, -half], [half, 1, -half], [half, 1, half], [-half, 1, half]], np.float32)
+    ground = np.asarray(floor(size=100.0).vertices)
+    mesh = Mesh(
+        jnp.asarray(np.concatenate([ground, lamp])),
+        jnp.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]),
+        jnp.full((4, 3), 0.5, jnp.float32),
+        emission=jnp.asarray([[0.0] * 3] * 2 + [[100.0] * 3] * 2),
+    )
+    scene = Scene(mesh=mesh, area_lights=lights.area_lights(mesh))
+    rays = Rays(jnp.asarray([[2.0, 3.0, 0.0]] * 8), jnp.asarray([[-0.5547002, -0.8320503, 0.0]] * 8), jnp.full(8, jnp.inf))
+    found = np.asarray(path_tracing.radiance(scene, rays, samples=64).mean.surface_from_light)
+    assert np.allclose(found, 0.5 / math.pi * 100.0 * (2 * half) ** 2, rtol=0.02)
+
+
 def test_closed_sphere_with_a_light_at_its_centre():
     """A sphere of albedo 1/2 around a point light has radiance 1 (pbrt-v4's scene): sum of all bounces."""
     mesh = sphere()
