@@ -88,8 +88,14 @@ def shadow(
     origin = ray_casting.offset_origin(
         jnp.asarray(np.asarray(surfels.position)[s]), jnp.asarray(np.asarray(surfels.normal)[s]), direction, scale=scale
     )
-    distance = np.asarray(connections.distance)[k, s] * (1.0 - _SHADOW_MARGIN)
-    blocked = np.asarray(ray_casting.occluded(caster, origin, direction, distance))
+    distance = np.asarray(connections.distance)[k, s]
+    # Aimed anew from the offset origin: on large meshes the offset exceeds the margin before the light's own surface.
+    finite = np.isfinite(distance)
+    to_light = np.asarray(surfels.position)[s] + np.where(finite, distance, 1.0)[:, None] * direction - np.asarray(origin)
+    reach = np.maximum(np.linalg.norm(to_light, axis=-1), 1e-20)
+    direction = np.where(finite[:, None], to_light / reach[:, None], direction)
+    distance = np.where(finite, reach, np.inf) * (1.0 - _SHADOW_MARGIN)
+    blocked = np.asarray(ray_casting.occluded(caster, origin, direction.astype(np.float32), distance.astype(np.float32)))
     irradiance[k[blocked], s[blocked]] = 0.0
     return Connections(connections.direction, connections.distance, irradiance)
 
