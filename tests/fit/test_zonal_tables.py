@@ -33,7 +33,8 @@ def test_area_list():
     found = zonal_tables.unscale_point(zonal_tables.area_table(1.0, np.pi / 3), 1.0)[0, 0]
     # the list left the kinks unresolved (its L_10 is 3e-6 low); the exact values: test_area_against_independent_quadrature
     np.testing.assert_allclose(found[:6], AREA, atol=1.5e-7)
-    irradiance = harmonics.half_irradiance(zonal_tables.area_table(1.0, np.pi / 3, order=11)[0, 0], np.array([0.0, 0, 1]))
+    coefficients = zonal_tables.area_table(1.0, np.pi / 3, order=11)[0, 0].astype(np.float32)
+    irradiance = harmonics.half_irradiance(coefficients, np.array([0, 0, 1], np.float32))
     assert abs(float(irradiance) * np.exp(-1) - 0.0991855) < 2e-4  # float32 and order 11; the list's value is exact
 
 
