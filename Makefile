@@ -24,10 +24,10 @@ pictures: $(INSTALLED)  ## the README's pictures
 	done
 
 test: $(INSTALLED)  ## the suite without its slow statistical part
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 test-slow: $(INSTALLED)  ## the slow statistical part alone
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m slow
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
