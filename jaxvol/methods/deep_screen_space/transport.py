@@ -26,8 +26,7 @@ _MARGIN = 1e-4
 class Cells(eqx.Module):
     """The samples' cells in a grid of resolution^3 over their bounding box, and one sample of each cell.
 
-    A sample drawn by its weight, not their mean: transmittance is convex, so that the mean place would make it too small (by
-    14 % of the layer in a dense cloud).
+    A sample drawn by its weight, not their mean: transmittance is convex, so that the mean place would make it too small.
     """
 
     index: Int[Array, "N A"]  # of the cell that each sample looks up
