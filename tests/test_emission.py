@@ -8,7 +8,7 @@ import pytest
 from jaxvol import emission, lights, sampling
 from jaxvol.types import DirectionalLights, Medium, Mesh, PointLights, Scene, SpotLights
 
-NUM = 1 << 18
+NUM = 1 << 19
 INTENSITY = np.array([3.0, 1.0, 0.25])
 # A medium of no consequence that gives the scene its extent: bounding sphere of radius 2 sqrt(3) about the origin.
 EXTENT = Medium(jnp.asarray([[-2.0] * 3, [2.0] * 3]), jnp.ones(3), jnp.zeros(3), jnp.float32(0.0))
