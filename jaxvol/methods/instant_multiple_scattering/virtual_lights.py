@@ -1,5 +1,7 @@
 """Virtual point lights: the vertices of light paths, sorted by what they contribute to, ready for the gather kernels."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -58,7 +60,7 @@ def _pad(values, size, filler=0.0):
 def _in_medium(medium, vertices, num_paths, size):
     strength = vertices.incident * vertices.density[:, None] * (np.asarray(medium.sigma_s) / num_paths)
     # Padding has a unit-sized direction, so that phase functions of it stay finite.
-    direction = _pad(vertices.direction, size, 3.0**-0.5)
+    direction = _pad(vertices.direction, size, math.sqrt(1.0 / 3.0))
     return VirtualLights(_pad(vertices.position, size), direction, _pad(strength, size))
 
 
