@@ -19,6 +19,7 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.types import Hits, Medium, Scene
 
 _MEAN_WEIGHT = 2.0 / 3.0  # integral of 1 - q^2 over q in (0, 1)
+_INFINITE = 1e28  # squared distance of a light's sampled position from which it counts as infinitely far
 
 
 def sample_distance(u: Float[Array, "*n"], d: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -86,45 +87,80 @@ def propose(scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array
     return Proposal(origin, direction, gain)
 
 
+class Step(NamedTuple):
+    """How the residual of each point goes on: what its ray meets, and where it will stop."""
+
+    s: Float[Array, "n"]  # distance of the surface met within the clamp distance; 0 where none is
+    meets: Bool[Array, "n"]
+    face: Int[Array, "n"]
+    to_surface: Float[Array, "n"]  # probability that the surface becomes the vertex
+    on_surface: Bool[Array, "n"]  # it does
+
+
+def choose_kind(scene: Scene, points: Points, s: Float[Array, "n"], face: Int[Array, "n"], u: Float[Array, "n"]) -> Step:
+    """Surface or medium: (s, face) is the surface that the ray meets within the clamp distance (inf, -1: none).
+
+    It becomes the vertex with probability 1 - F(s)/2, else one in the medium before it.
+    """
+    meets = jnp.asarray(face) >= 0
+    to_surface = jnp.where(meets, 1.0, 0.0)
+    if scene.medium is not None:
+        to_surface = jnp.where(meets, 1.0 - 0.5 * distance_cdf(jnp.asarray(s), points.clamp), 0.0)
+    return Step(jnp.where(meets, jnp.asarray(s), 0.0), meets, jnp.asarray(face), to_surface, u < to_surface)
+
+
+def distance_onwards(
+    points: Points, step: Step, u: Float[Array, "n"], sigma: Float[Array, "n"], *, distance: str
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """A distance in the medium, by the weight or as the paper does (`sigma`: local mean extinction), and weight / pdf."""
+    d = points.clamp
+    limit = jnp.where(step.meets, step.s, d)
+    if distance == "weight":
+        reach = distance_cdf(limit, d)
+        return sample_distance(u * reach, d), reach * (_MEAN_WEIGHT * d)
+    t = sample_distance_exponential(u, limit, sigma)
+    return t, weight(t, d) / jnp.maximum(sample_distance_exponential_pdf(t, limit, sigma), 1e-30)
+
+
+def distance_to_light(
+    points: Points, proposal: Proposal, step: Step, u: Float[Array, "n"], target: Float[Array, "n 3"]
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """A distance in the medium, equi-angular as seen from the light at `target`, and weight / pdf.
+
+    Without it 1/r^2 to a light in the medium has infinite variance. Towards infinite lights by the weight.
+    """
+    d = points.clamp
+    limit = jnp.where(step.meets, step.s, d)
+    far = sampling.dot(target, target) > _INFINITE
+    near = jnp.where(far[:, None], proposal.origin + d[:, None] * proposal.direction, target)
+    zero = jnp.zeros_like(limit)
+    t, pdf = sampling.sample_equiangular(u, proposal.origin, proposal.direction, zero, limit, near)
+    reach = distance_cdf(limit, d)
+    t = jnp.where(far, sample_distance(u * reach, d), t)
+    return t, jnp.where(far, reach * (_MEAN_WEIGHT * d), weight(t, d) / jnp.maximum(pdf, 1e-30))
+
+
 def new_vertices(
     scene: Scene,
     points: Points,
     proposal: Proposal,
-    s: Float[Array, "n"],
-    face: Int[Array, "n"],
-    u: Float[Array, "n"],
-    u_kind: Float[Array, "n"],
+    step: Step,
+    t: Float[Array, "n"],
+    factor: Float[Array, "n"],
     sigma: Float[Array, "n"],
     *,
-    distance: str,
     transmittance: str,
     num_steps: int,
 ) -> tuple[Points, Float[Array, "n 3"]]:
     """The new vertices x' and what carries their light to the points: gain tau(x, x') max(0, 1 - t^2/d^2) / p(t).
 
-    (s, face) is the surface that the ray meets within the clamp distance (inf, -1: none); it becomes the vertex with
-    probability 1 - F(s)/2, else one in the medium before it. `sigma` is the local mean extinction: for the paper's
-    distance="exponential" and, with transmittance="local", in place of the true one (biased).
+    (t, factor) is the distance in the medium and its weight / pdf. `sigma` is the local mean extinction that with
+    transmittance="local" takes the place of the true one (biased).
     """
-    d = points.clamp
     medium = scene.medium
-    meets = jnp.asarray(face) >= 0
-    reach = jnp.where(meets, distance_cdf(s, d), 1.0)
-    to_surface = jnp.where(meets, 1.0 - 0.5 * reach, 0.0)
-    if medium is None:
-        to_surface = jnp.where(meets, 1.0, 0.0)
-    on_surface = u_kind < to_surface
-    if distance == "weight":
-        t = sample_distance(u * reach, d)
-        factor = reach * (_MEAN_WEIGHT * d)
-    else:
-        limit = jnp.minimum(jnp.asarray(s), d)
-        t = sample_distance_exponential(u, limit, sigma)
-        factor = weight(t, d) / sample_distance_exponential_pdf(t, limit, sigma)
-    factor = factor / jnp.maximum(1.0 - to_surface, 1e-6)
-    s_safe = jnp.where(meets, jnp.asarray(s), 0.0)
-    t = jnp.where(on_surface, s_safe, t)
-    factor = jnp.where(on_surface, weight(t, d) / jnp.maximum(to_surface, 1e-6), factor)
+    factor = factor / jnp.maximum(1.0 - step.to_surface, 1e-6)
+    t = jnp.where(step.on_surface, step.s, t)
+    factor = jnp.where(step.on_surface, weight(t, points.clamp) / jnp.maximum(step.to_surface, 1e-6), factor)
     position = proposal.origin + t[:, None] * proposal.direction
     throughput = proposal.gain * factor[:, None]
     scattering = jnp.zeros_like(throughput)
@@ -138,17 +174,18 @@ def new_vertices(
         throughput = throughput * jnp.exp(-depth)
     outgoing = -proposal.direction
     if points.on_surface is None:
-        return Points(position, outgoing, scattering, d), throughput
-    hit: Hits = ray_casting.hits(scene.mesh, proposal.origin, proposal.direction, jnp.where(meets, s, jnp.inf), face)
-    on = on_surface[:, None]
+        return Points(position, outgoing, scattering, points.clamp), throughput
+    distance = jnp.where(step.meets, step.s, jnp.inf)
+    hit: Hits = ray_casting.hits(scene.mesh, proposal.origin, proposal.direction, distance, step.face)
+    on = step.on_surface[:, None]
     found = Points(
         jnp.where(on, hit.position, position),
         outgoing,
         jnp.where(on, 0.0, scattering),
-        d,
-        on_surface,
+        points.clamp,
+        step.on_surface,
         hit.normal,
-        materials.surface_at(scene.mesh, face),
+        materials.surface_at(scene.mesh, step.face),
     )
     return found, throughput
 

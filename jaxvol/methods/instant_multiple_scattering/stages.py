@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt
 
+from jaxvol import lights as primary
 from jaxvol import media, ray_casting, sampling
 from jaxvol.methods.instant_multiple_scattering import compensation, gathering, picking, receivers
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
@@ -220,19 +221,27 @@ def compensate(
         u = _chain_uniforms(context.seed, index, jnp.int32(chain * plan.num_levels + level))
         proposal = _propose(scene, points, u)
         s, face = _surface_within(context, points, proposal)
-        points, throughput, sample, origin = _advance(
-            scene, context.mip, points, proposal, throughput, s, face, u, plan=plan, lit=lit
-        )
+        arguments = (scene, context.mip, points, proposal, throughput, s, face, u)
+        if lit:
+            sums = _add_primary(context, sums, arguments, first=level == 0)
+            if level == plan.num_levels - 1:
+                return sums
+        points, throughput = _advance(*arguments, plan=plan)
         if not lit:
             found = _gather_at_end(context, points, u[5], chain, level)
             sums = {**sums, "multiple": _add_product(sums["multiple"], throughput, *found.values())}
-            continue
-        visible = None
-        if scene.mesh is not None:
-            short = sample.distance * (1.0 - 1e-4)
-            visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
-        sums = _book_direct(scene, sums, points, throughput, sample, visible, jnp.bool_(level == 0), plan=plan)
     return sums
+
+
+def _add_primary(context, sums, arguments, *, first):
+    """The primary lights' share of one level, at vertices of their own: close to the light that was chosen."""
+    scene, plan = context.scene, context.plan
+    found, throughput, sample, origin = _towards_light(*arguments, plan=plan)
+    visible = None
+    if scene.mesh is not None:
+        short = sample.distance * (1.0 - 1e-4)
+        visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
+    return _book_direct(scene, sums, found, throughput, sample, visible, jnp.bool_(first), plan=plan)
 
 
 @jax.jit
@@ -260,26 +269,37 @@ def _propose(scene, points, u):
     return compensation.propose(scene, points, u[0], u[1], u[2])
 
 
-@partial(jax.jit, static_argnames=("plan", "lit"))
-def _advance(scene, mip, points, proposal, throughput, s, face, u, *, plan, lit):
-    """New vertices with their clamp distance, the throughput to them, and a direction to a primary light."""
+@partial(jax.jit, static_argnames="plan")
+def _advance(scene, mip, points, proposal, throughput, s, face, u, *, plan):
+    """New vertices with their clamp distance, and the throughput to them."""
     sigma = compensation.local_sigma(scene.medium, mip, points.position)
+    step = compensation.choose_kind(scene, points, s, face, u[4])
+    t, factor = compensation.distance_onwards(points, step, u[3], sigma, distance=plan.distance)
     found, gain = compensation.new_vertices(
-        scene,
-        points,
-        proposal,
-        s,
-        face,
-        u[3],
-        u[4],
-        sigma,
-        distance=plan.distance,
-        transmittance=plan.transmittance,
-        num_steps=max(4, plan.pair_steps // 4),
+        scene, points, proposal, step, t, factor, sigma, transmittance=plan.transmittance, num_steps=_steps_within(plan)
     )
     found = with_clamp(found, clamp_at(scene, mip, found.position, plan=plan))
-    sample, origin = compensation.sample_primary(scene, found, u[6], u[7], u[8]) if lit else (None, None)
+    return found, throughput * gain
+
+
+@partial(jax.jit, static_argnames="plan")
+def _towards_light(scene, mip, points, proposal, throughput, s, face, u, *, plan):
+    """Vertices for the light of the primary lights, the throughput to them, the light and the shadow ray's origin."""
+    sigma = compensation.local_sigma(scene.medium, mip, points.position)
+    step = compensation.choose_kind(scene, points, s, face, u[4])
+    target = primary.sample_light(scene, points.position, u[6], u[7], u[8]).position
+    t, factor = compensation.distance_to_light(points, proposal, step, u[9], target)
+    found, gain = compensation.new_vertices(
+        scene, points, proposal, step, t, factor, sigma, transmittance=plan.transmittance, num_steps=_steps_within(plan)
+    )
+    # The same numbers lead to the same point of the same light.
+    sample, origin = compensation.sample_primary(scene, found, u[6], u[7], u[8])
     return found, throughput * gain, sample, origin
+
+
+def _steps_within(plan):
+    """Steps of a march that is no longer than the clamp distance."""
+    return max(4, plan.pair_steps // 4)
 
 
 @partial(jax.jit, static_argnames="plan")
