@@ -2,15 +2,20 @@
 
 The lattice's links are few: 26 directions leave ray effects, and in a slab a third of their weight never meets its faces
 (reflectance of a slab of thickness 2: +6 %). `transport` here runs the same kind of sweep along the 80 directions of the
-level-symmetric S8 set (Carlson and Lathrop 1965), each between planes of its dominant axis with bilinear interpolation;
-inside a voxel attenuation and source are exact for constant sigma. `correct` then removes the lattice's angular error by
-defect correction: phi <- phi + (I - B26 k)^-1 (B80 (k phi + b) - phi), one or two of them, each a lattice solve.
+level-symmetric S8 set (Carlson and Lathrop 1965), each from plane to plane of its dominant axis. What a voxel passes on
+and emits is the lattice's own map (`beta_gamma`), which keeps all power; between the columns of a plane intensities are
+interpolated by parabolas: linear interpolation spreads light sideways by f (1 - f) voxels^2 a step, which is 8 % of the
+diffusion constant at sigma_t h = 0.5 (measured: a point source in a cube 4.1 % off with it, 1.3 % without). `correct`
+in illumination.py removes the lattice's angular error by defect correction: phi <- phi + (I - B26 k)^-1 (B80 (k phi + b)
+- phi), one or two of them, each a lattice solve. First order at lit faces: cube 4.0, 2.2 % at sigma_t h = 1, 0.5.
 """
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+
+from jaxvol.methods.lattice_boltzmann.lattice import ProbabilityMap, beta_gamma
 
 # cosines and weights (of one octant, sum 1) of the level-symmetric S8 set
 _MU = (0.2182179, 0.5773503, 0.7867958, 0.9511897)
@@ -31,7 +36,9 @@ def directions() -> tuple[tuple[tuple[float, float, float], float], ...]:
     return tuple(sorted(found.items()))
 
 
-def transport(extinction: Float[Array, "X Y Z"], source: Float[Array, "X Y Z"]) -> Float[Array, "X Y Z"]:
+def transport(
+    extinction: Float[Array, "X Y Z"], source: Float[Array, "X Y Z"], *, kind: ProbabilityMap = "pade"
+) -> Float[Array, "X Y Z"]:
     """phi: the fluence times h^2 that an isotropic source [W per voxel] makes without scattering; sigma_t h per voxel."""
     phi = jnp.zeros_like(source)
     for axis in range(3):
@@ -43,40 +50,48 @@ def transport(extinction: Float[Array, "X Y Z"], source: Float[Array, "X Y Z"]) 
                 length = 1.0 / vector[axis]
                 mine.append((round(length, 6), weight, vector[along[1]] * length, vector[along[2]] * length))
         moved = [jnp.transpose(x, along) for x in (extinction, source)]
-        total = _scan(*moved, mine, sense=1) + _scan(*moved, mine, sense=-1)
+        total = _scan(*moved, mine, kind, sense=1) + _scan(*moved, mine, kind, sense=-1)
         phi = phi + jnp.transpose(total, back)
     return phi
 
 
-def _scan(extinction, source, steps, *, sense):
+def _scan(extinction, source, steps, kind, *, sense):
     lengths = sorted({length for length, *_ in steps})
 
     def body(faces, planes):
         sigma, emitted = planes
-        half = {}
+        voxel = {}
         for length in lengths:
-            x = 0.5 * length * sigma
-            through = jnp.exp(-x)
-            thin = x < 1e-3
-            mean = jnp.where(thin, 1.0 - 0.5 * x, -jnp.expm1(-x) / jnp.where(thin, 1.0, x))
-            half[length] = through, 0.5 * length * mean * emitted
+            beta, gamma = beta_gamma(length * sigma, kind)
+            voxel[length] = beta, length * gamma * emitted, 1.0 - length * sigma * beta, length * beta * emitted
         total, leaving = 0.0, []
         for face, (length, weight, row_shift, column_shift) in zip(faces, steps, strict=True):
-            through, made = half[length]
-            here = through * _shift(face, sense * row_shift, sense * column_shift) + made
-            total = total + weight * here
-            leaving.append(through * here + made)
+            beta, own, through, made = voxel[length]
+            face = _shift(_shift(face, 0, sense * row_shift), 1, sense * column_shift)
+            total = total + weight * (beta * face + own)
+            leaving.append(through * face + made)
         return tuple(leaving), total
 
     start = tuple(jnp.zeros(source.shape[1:], source.dtype) for _ in steps)
     return lax.scan(body, start, (extinction, source), reverse=sense < 0)[1]
 
 
-def _shift(plane, row, column):
-    """The plane moved by fractions of a voxel, bilinear; zeros come in."""
-    for axis, amount in ((0, row), (1, column)):
-        sign, fraction = (1 if amount > 0 else -1), min(abs(amount), 1.0)
-        padding = [(sign, -sign, 0) if a == axis else (0, 0, 0) for a in range(2)]
-        neighbour = lax.pad(plane, jnp.zeros((), plane.dtype), padding)
-        plane = neighbour if fraction > 1 - 1e-6 else (1.0 - fraction) * plane + fraction * neighbour
-    return plane
+def _shift(plane, axis, amount):
+    """The plane moved by a fraction of a voxel, at most 1: parabola through the three nearest columns.
+
+    Dark columns come in; where light goes out, the last column is held.
+    """
+    if abs(amount) < 1e-6:
+        return plane
+    size, forward = plane.shape[axis], amount > 0
+    nearest = int(np.floor(amount + 0.5))
+    t = amount - nearest
+    edge = lax.slice_in_dim(plane, size - 1, size, axis=axis) if forward else lax.slice_in_dim(plane, 0, 1, axis=axis)
+    dark = jnp.zeros_like(edge)
+    padded = jnp.concatenate([dark, dark, plane, edge] if forward else [edge, plane, dark, dark], axis=axis)
+    first = 2 if forward else 1
+    out = 0.0
+    for tap, share in ((nearest, 1.0 - t * t), (nearest + 1, 0.5 * t * (t + 1.0)), (nearest - 1, 0.5 * t * (t - 1.0))):
+        if abs(share) > 1e-6:
+            out = out + share * lax.slice_in_dim(padded, first - tap, first - tap + size, axis=axis)
+    return out

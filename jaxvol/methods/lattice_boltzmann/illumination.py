@@ -125,7 +125,7 @@ def _channel(scattering, absorption, deposit, first, wall, plan):
     if wall is not None:
         deposit, first = (jnp.where(wall, 0.0, x) for x in (deposit, first))
     if not plan.corrections:
-        answer = solve_channel(scattering, absorption, deposit, wall, plan.internal_reflectance, plan=plan)
+        answer = solve_channel(scattering, absorption, deposit, wall, plan.internal_reflectance, plan.tolerance, plan=plan)
         from_volume = (
             answer.phi_first if not plan.num_surface_rays else lattice_transport(scattering, absorption, first, wall, plan=plan)
         )
@@ -135,25 +135,26 @@ def _channel(scattering, absorption, deposit, first, wall, plan):
     applications, residual, converged = jnp.zeros((), jnp.int32), jnp.zeros(()), jnp.asarray(True)
     once = None
     for _ in range(1 + plan.corrections):
-        arriving = fine_transport(extinction, scattering * phi + deposit)
+        arriving = fine_transport(extinction, scattering * phi + deposit, kind=plan.probability_map)
         once = arriving if once is None else once
         defect = arriving - phi
         # an error of the correction weighs as much less as the defect is smaller than the light itself
         share = jnp.sqrt(jnp.sum(defect * defect) / jnp.maximum(jnp.sum(arriving * arriving), 1e-30))
-        answer = solve_channel(scattering, absorption, scattering * defect, None, 0.0, plan=plan)
+        tolerance = jnp.minimum(plan.tolerance / jnp.maximum(share, 1e-6), 0.1)
+        answer = solve_channel(scattering, absorption, scattering * defect, None, 0.0, tolerance, plan=plan)
         phi = phi + defect + answer.phi
         applications = applications + answer.num_applications
         residual = jnp.maximum(residual, share * answer.residual)
         converged = converged & answer.converged
-    from_volume = fine_transport(extinction, first) if plan.num_surface_rays else once
+    from_volume = fine_transport(extinction, first, kind=plan.probability_map) if plan.num_surface_rays else once
     return from_volume, phi, applications, residual, converged
 
 
-def _solve_channel(scattering, absorption, deposit, wall, reflectance, *, plan):
+def _solve_channel(scattering, absorption, deposit, wall, reflectance, tolerance, *, plan):
     directions = lattice(plan.lattice)
     co = coefficients(directions, scattering, absorption, kind=plan.probability_map, wall=wall, wall_reflectance=reflectance)
     levels = preconditioner.build(deposit.shape, scattering + absorption, absorption) if plan.preconditioned else None
-    return solve(directions, co, deposit, tolerance=plan.tolerance, max_steps=plan.max_applications, levels=levels)
+    return solve(directions, co, deposit, tolerance=tolerance, max_steps=plan.max_applications, levels=levels)
 
 
 def _lattice_transport(scattering, absorption, source, wall, *, plan):
@@ -164,4 +165,4 @@ def _lattice_transport(scattering, absorption, source, wall, *, plan):
 
 solve_channel = jax.jit(_solve_channel, static_argnames="plan")
 lattice_transport = jax.jit(_lattice_transport, static_argnames="plan")
-fine_transport = jax.jit(fine_sweeps.transport)
+fine_transport = jax.jit(fine_sweeps.transport, static_argnames="kind")
