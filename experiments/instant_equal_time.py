@@ -128,7 +128,7 @@ def main():
     parser.add_argument("--reference", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--levels", type=int, default=3)
-    parser.add_argument("--mean-free-paths", type=float, default=0.5)
+    parser.add_argument("--mean-free-paths", type=float, default=0.35)
     arguments = parser.parse_args()
     import drjit
     import mitsuba as mi

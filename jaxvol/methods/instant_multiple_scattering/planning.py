@@ -77,7 +77,7 @@ def plan(
     num_paths: int = 1024,
     num_sets: int = 1,
     max_depth: int = 256,
-    mean_free_paths: float | None = 0.5,
+    mean_free_paths: float | None = 0.35,
     num_levels: int = 3,
     num_chains: int = 2,
     num_direct: int = 4,
@@ -107,8 +107,8 @@ def plan(
     num_levels: compensation steps; 0 = clamped only (biased). num_chains: chains of new vertices per receiver
     that gather from virtual lights; num_direct: chains that only see the primary lights, which are cheap.
     light_stride: new vertices gather from one of `light_stride` lights, another share each time.
-    end: what happens beyond the last step: "clamped" (loses about (1/3)^(num_levels + 1) of the energy), "unclamped"
-    (unbiased, infinite variance), "reduced" (bound times 16).
+    end: what happens beyond the last step: "clamped" (loses about (0.7 mean_free_paths)^(num_levels + 1) of the energy,
+    0.4 % by default), "unclamped" (unbiased, infinite variance), "reduced" (bound times 16).
     distance: "weight" or the paper's "exponential"; transmittance to new vertices: "true" or "local" (biased);
     visibility of new vertices: "rays" or "none" (biased near surfaces).
     direct_at_vertex: False leaves out the primary lights there, as the paper's text does (biased).
