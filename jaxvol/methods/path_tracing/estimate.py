@@ -1,6 +1,8 @@
 """Plan, run and turn the film into layers with their variance."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -162,12 +164,21 @@ def add_samples(
     if plan.drop_medium:
         scene = Scene(**{**{f: getattr(scene, f) for f in Scene.__dataclass_fields__}, "medium": None})
     total = sensors.num_pixels(sensor)
-    for first in range(0, total, _RANGE):
-        count = min(_RANGE, total - first)
-        report = None
-        if on_progress is not None:
-            report = lambda share, first=first, count=count: on_progress((first + share * count) / total)  # noqa: E731
-        part = driver.run(
+    pixels = [(first, min(_RANGE, total - first)) for first in range(0, total, _RANGE)]
+    # A host loop keeps one core busy: cores share a batch by its samples.
+    shares = min(num_samples, host_threads()) if driver.on_host(scene, plan.settings, plan.caster) else 1
+    cuts = [num_samples * i // shares for i in range(shares + 1)]
+    jobs = [(p, low, high) for p in pixels for low, high in zip(cuts[:-1], cuts[1:], strict=True)]
+    done = [0.0] * len(jobs)
+
+    def trace(number):
+        (first, count), low, high = jobs[number]
+
+        def report(share):
+            done[number] = share
+            on_progress(sum(done) / len(done))
+
+        return driver.run(
             scene,
             sensor,
             plan.settings,
@@ -179,11 +190,23 @@ def add_samples(
             seed=seed,
             first_pixel=first,
             num_pixels=count,
-            first_sample=first_sample,
-            num_samples=num_samples,
-            on_step=report,
+            first_sample=first_sample + low,
+            num_samples=high - low,
+            on_step=None if on_progress is None else report,
         )
-        film[:, first : first + count] += part.reshape(2, count, -1)
+
+    with ThreadPoolExecutor(shares) as pool:
+        for begin in range(0, len(jobs), shares):
+            parts = [pool.submit(trace, number) for number in range(begin, begin + shares)]
+            (first, count), _, _ = jobs[begin]
+            for part in parts:  # in order, so that a render repeats to the last bit
+                film[:, first : first + count] += part.result().reshape(2, count, -1)
+            done[begin : begin + shares] = [1.0] * shares
+
+
+def host_threads() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def empty_film(sensor: sensors.Sensor, plan: Plan) -> np.ndarray:

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
+from jaxvol.columns import Columns
+
 EMISSION, SURFACE_LIGHT, VOLUME_LIGHT, FROM_SURFACE, FROM_VOLUME, FROM_MULTIPLE = range(6)
 NUM_GROUPS = 6  # emission; surface_from_light; volume_from_light; X_from_surface; X_from_volume; X_from_multiple
 
@@ -200,12 +202,19 @@ def flush(film: Float[Array, "rows columns"], sums: Sums, finished: Finished, nu
     return film.at[row].add(film_columns(sums), mode="drop")
 
 
+def rows(value, index: np.ndarray) -> np.ndarray:
+    """Chosen rows of an array that may be split into columns, as numpy."""
+    if isinstance(value, Columns):
+        return np.stack([np.asarray(c)[index] for c in value.columns], axis=1)
+    return np.asarray(value)[index]
+
+
 def flush_host(film: np.ndarray, sums: Sums, finished: Finished, num_pixels: int, first_pixel: int) -> None:
     """The same in place with numpy, touching only finished lanes: XLA's scatter on the CPU pays for all of them."""
     lane = np.flatnonzero(np.asarray(finished.valid))
     if not lane.size:
         return
-    columns = film_columns(tuple(None if s is None else np.asarray(s)[lane] for s in sums))
+    columns = film_columns(tuple(None if s is None else rows(s, lane) for s in sums))
     pixel, first_volume = np.asarray(finished.pixel)[lane], np.asarray(finished.first_volume)[lane]
     row = pixel - first_pixel + first_volume * num_pixels
     while lane.size:  # rounds without repeated rows: `+=` keeps only one of those
