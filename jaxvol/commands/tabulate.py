@@ -58,7 +58,13 @@ def tabulate(
     jobs.Parts(folder, config={}, restart=True).clear()
     for name, error in table.metadata["errors"].items():
         print(f"{name}: estimated relative error {error:.1e}")
-    print(f"wrote {out} ({out.stat().st_size / 1e3:.0f} kB, parts computed in {table.metadata['seconds']} s)")
+    for name, seconds in table.metadata["part_seconds"].items():
+        print(f"{name}: compile {seconds['compile']:.2f} s, run {seconds['run']:.2f} s (on a core {seconds['cpu']:.2f} s)")
+    wall = table.metadata["seconds"]
+    print(
+        f"wrote {out} ({out.stat().st_size / 1e3:.0f} kB); plan {wall['plan']} s, parts {wall['parts']} s on all cores, "
+        f"join {wall['join']} s, estimating errors {wall['errors']} s"
+    )
 
 
 def _verify(path: Path, num: int, seed: int) -> None:

@@ -12,6 +12,7 @@ from math import pi
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
+from scipy.linalg import eigh
 
 from jaxvol import airlight, harmonics
 
@@ -52,8 +53,15 @@ def source_function(albedo: complex, moments: np.ndarray, *, num_streams: int = 
     # -rate mu even = -loss_odd odd and -rate mu odd = -loss_even even. Eigenvalues of the inverse, 1/rate^2, because the
     # slow modes matter and would drown in rounding beside the fast ones (1/mu^2 up to 1e12).
     odd_from_even = np.linalg.solve(loss_odd, np.diag(mu))
-    square, even_modes = np.linalg.eig(np.linalg.solve(loss_even, mu[:, None] * odd_from_even))
-    rate = 1 / np.sqrt(square.astype(complex))
+    if isinstance(albedo, complex):
+        square, even_modes = np.linalg.eig(np.linalg.solve(loss_even, mu[:, None] * odd_from_even))
+    else:  # with weights on both sides both matrices are symmetric and positive
+        root = np.sqrt(weight)
+        square, even_modes = eigh(*(_symmetric(root[:, None] * v / root) for v in (mu[:, None] * odd_from_even, loss_even)))
+        even_modes = even_modes / root[:, None]
+    fastest = mu.min() ** 2 / 2  # no mode decays faster; rounding says otherwise of the last few
+    square = np.where(square.real < fastest, fastest, square)
+    rate = 1 / np.sqrt(square)
     odd_modes = rate * (odd_from_even @ even_modes)
     beam = [(polynomials[:, parity] @ strength[parity]) / (4 * pi) for parity in (odd, even)]
     system = np.block([[-np.diag(mu), loss_odd], [loss_even, -np.diag(mu)]])
@@ -64,6 +72,10 @@ def source_function(albedo: complex, moments: np.ndarray, *, num_streams: int = 
     projection = (polynomials * weight[:, None]).T
     radiance = np.where(even[:, None], projection @ even_part, projection @ odd_part)
     return np.append(rate, 1.0), strength[:, None] * radiance, 4 * pi * radiance[0]
+
+
+def _symmetric(matrix: np.ndarray) -> np.ndarray:
+    return (matrix + matrix.T) / 2
 
 
 def _gather(tau: np.ndarray, rate: np.ndarray, mu: np.ndarray) -> np.ndarray:
@@ -89,8 +101,6 @@ def directional_table(
     if not abs(albedo) < 1:
         raise ValueError(f"albedo = {albedo} must lie in [0, 1)")
     rate, source, _ = source_function(albedo, moments, num_streams=num_streams)
-    if not isinstance(albedo, complex):
-        rate, source = rate.real, source.real
     x, _, weight = airlight.double_exponential(num_nodes)
     mu, weight = np.concatenate([x, -x]), np.concatenate([weight, weight])
     source_at = legvander(mu, source.shape[0] - 1) @ source

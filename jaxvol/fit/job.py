@@ -1,16 +1,39 @@
 """The table job: parts computed on all cores, saved as they finish, joined, judged and written; and its verification."""
 
 import os
+import threading
 import time
+from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from jaxvol import __version__, jobs, tables, zonal_lookup
 from jaxvol.fit import assemble, compact, phase_moments, validation, wavenumber
 from jaxvol.fit.table_config import TableConfig, parse
+
+_compiling = threading.local()  # seconds that this thread has spent in the compiler
+_COMPILE_EVENTS = ("/jax/core/compile/jaxpr_to_mlir_module_duration", "/jax/core/compile/backend_compile_duration")
+
+
+def _note_compilation(event: str, duration: float, **_) -> None:
+    if event in _COMPILE_EVENTS:
+        _compiling.seconds = getattr(_compiling, "seconds", 0.0) + duration
+
+
+jax.monitoring.register_event_duration_secs_listener(_note_compilation)
+
+
+class Seconds(NamedTuple):
+    """What one part took: compilation, everything else, and the share of it that its thread had a core."""
+
+    compile: float
+    run: float
+    cpu: float
 
 
 class Interrupted(Exception):
@@ -25,40 +48,70 @@ def tabulate(
     The folder is left in place (the caller clears it once the result is safe). Raises `Interrupted` after the first Ctrl-C,
     ValueError where the folder belongs to another configuration.
     """
+    start = time.perf_counter()
     values = config.model_dump(mode="json")
     store = None if parts_folder is None else jobs.Parts(parts_folder, config={"tables": values, "version": __version__})
     names = assemble.part_names(config)
     done = {} if store is None else {name: store.get(name) for name in names}
     done = {name: arrays for name, arrays in done.items() if arrays is not None}
+    plan = time.perf_counter() - start
     start = time.perf_counter()
+    timing: dict[str, Seconds] = {}
     missing = [name for name in names if name not in done]
     with jobs.stoppable() as stop, jobs.progress("tables", total=len(names)) as advance:
         advance(len(done), note="from an earlier run" if done else "")
-        for name, arrays in _computed(missing, config, workers or os.cpu_count() or 1, stop):
-            done[name] = arrays
+        for name, arrays, seconds in _computed(missing, config, workers or os.cpu_count() or 1, stop):
+            done[name], timing[name] = arrays, seconds
             if store is not None:
                 store.put(name, arrays)
             advance(1, note=name)
     if len(done) < len(names):
         raise Interrupted(f"{len(done)} of {len(names)} parts are done")
-    seconds = time.perf_counter() - start
+    parts = time.perf_counter() - start
     arrays = assemble.join(done, config)
+    joined = time.perf_counter() - start - parts
     errors = assemble.estimate_errors(arrays, config)
-    return tables.seal(arrays, {"config": values, "errors": errors, "seconds": round(seconds, 2)})
+    seconds = {"plan": plan, "parts": parts, "join": joined, "errors": time.perf_counter() - start - parts - joined}
+    seconds = {key: round(value, 2) for key, value in seconds.items()}
+    return tables.seal(arrays, {"config": values, "errors": errors, "seconds": seconds, "part_seconds": _by_table(timing)})
 
 
-def _computed(names, config, workers, stop):
-    """(name, arrays) as they finish, on a few threads (numpy releases the interpreter); no new part once `stop` is set."""
-    with ThreadPoolExecutor(max_workers=workers) as pool:
+def _by_table(timing: dict[str, Seconds]) -> dict[str, dict[str, float]]:
+    """Seconds of one thread by table (parts of one table together): of this run's parts only."""
+    total: dict[str, dict[str, float]] = {}
+    for name, seconds in timing.items():
+        entry = total.setdefault("-".join(name.split("-")[:2]), {"compile": 0.0, "run": 0.0, "cpu": 0.0})
+        entry["compile"] += seconds.compile
+        entry["run"] += seconds.run
+        entry["cpu"] += seconds.cpu
+    return {name: {key: round(value, 3) for key, value in sorted(entry.items())} for name, entry in sorted(total.items())}
+
+
+def _timed(name: str, config: TableConfig) -> tuple[dict[str, np.ndarray], Seconds]:
+    compiled, start, cpu = getattr(_compiling, "seconds", 0.0), time.perf_counter(), time.thread_time()
+    arrays = assemble.compute_part(name, config)
+    compiled = getattr(_compiling, "seconds", 0.0) - compiled
+    run = time.perf_counter() - start - compiled
+    return arrays, Seconds(compiled, run, min(run, time.thread_time() - cpu))
+
+
+def _computed(
+    names: list[str], config: TableConfig, workers: int, stop
+) -> Iterator[tuple[str, dict[str, np.ndarray], Seconds]]:
+    """(name, arrays, seconds) as they finish, on a few threads (numpy releases the interpreter); none new once `stop` is set.
+
+    Linear algebra keeps to one thread per part: two levels of threads take each other's cores.
+    """
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
         waiting, running = list(names), {}
         while waiting or running:
             while waiting and len(running) < workers and not stop:
                 name = waiting.pop(0)
-                running[pool.submit(assemble.compute_part, name, config)] = name
+                running[pool.submit(_timed, name, config)] = name
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield running.pop(future), future.result()
+                yield running.pop(future), *future.result()
 
 
 class Check(NamedTuple):

@@ -36,7 +36,7 @@ class AreaMultiple(_Table):
 
     num_tau: Nodes = 18
     num_albedo: Axis = 10
-    num_g: Axis = 9
+    num_g: Axis = 17
     source_bands: Annotated[int, Field(ge=1, le=24)] = 10  # moments of the patch's emission
 
 
@@ -47,8 +47,8 @@ class Multiple(_Table):
     num_tau: Nodes = 24
     albedo: tuple[Albedo, Albedo] = (0.0, 1.0)
     num_albedo: Axis = 12
-    g: tuple[G, G] = (-0.6, 0.6)
-    num_g: Axis = 9
+    g: tuple[G, G] = (-0.9, 0.9)
+    num_g: Axis = 17
     bounces: Annotated[int, Field(ge=1, le=40)] = 8  # single bounces 2..bounces; 1 = none
     bounce_g: tuple[G, ...] = (0.0,)
     area: AreaMultiple = AreaMultiple()

@@ -20,6 +20,7 @@ This replaces both the bounce-by-bounce Monte Carlo of Dubouchet et al. 2019, se
 emitters enter through the moments of their emission ("source moments").
 """
 
+from functools import cache
 from math import pi, sqrt
 
 import numpy as np
@@ -27,6 +28,7 @@ from numpy.polynomial.legendre import leggauss, legvander
 from scipy.special import spherical_jn
 
 MAX_MOMENTS = 256
+_CHUNK = 2048  # nodes at a time: fewer do not keep two threads busy, more do not fit the cache
 _TAIL = 900  # levels of the backward continued fraction; enough for |k| < 50
 
 
@@ -65,55 +67,74 @@ def _tails(k: np.ndarray, m: int, last: int) -> np.ndarray:
     return tail
 
 
-def _solve(k: np.ndarray, m: int, diagonal: np.ndarray, tail: np.ndarray, source: np.ndarray) -> np.ndarray:
-    """psi_l, l = m..m+N-1, of the tridiagonal system; `source` `[N, columns, nodes]`, `diagonal` `[N]`, `tail` = F_{m+N}."""
-    num = diagonal.size
+def _solve(
+    k: np.ndarray, m: int, diagonal: np.ndarray, tail: np.ndarray, source: np.ndarray, *, keep: int | None = None
+) -> np.ndarray:
+    """psi_l, l = m..m+keep-1, of the tridiagonal system, `[keep, columns, media, nodes]` (keep None: all N).
+
+    `source` `[N, columns, 1, nodes]`, `diagonal` `[N, media, nodes]` (1 where shared), `tail` = F_{m+N} `[nodes]`.
+    """
+    num = diagonal.shape[0]
+    keep = num if keep is None else min(keep, num)
     square = k * k
-    pivots = np.empty((num, k.size), dtype=complex)
-    pivots[-1] = diagonal[-1] + square * _coupling(m + num, m) * tail
-    ratios = np.empty_like(pivots)  # -i k b / pivot
-    reduced = source.astype(complex)
-    for index in range(num - 2, -1, -1):  # eliminate from the highest band down
-        link = 1j * k * sqrt(_coupling(m + index + 1, m))
-        ratios[index + 1] = -link / pivots[index + 1]
-        pivots[index] = diagonal[index] + link * ratios[index + 1]
-        reduced[index] += ratios[index + 1] * reduced[index + 1]
-    psi = np.empty_like(reduced)
-    psi[0] = reduced[0] / pivots[0]
-    for index in range(1, num):
-        psi[index] = reduced[index] / pivots[index] + ratios[index] * psi[index - 1]
-    return psi
+    pivots, ratios, reduced = {}, {}, {}  # ratio = -i k b / pivot; only what the way back up needs is kept
+    pivot = diagonal[-1] + square * (_coupling(m + num, m) * tail)
+    value = source[-1]
+    for index in range(num - 1, -1, -1):  # eliminate from the highest band down
+        if index < num - 1:
+            link = 1j * sqrt(_coupling(m + index + 1, m)) * k
+            ratio = -link / pivot
+            pivot = diagonal[index] + link * ratio
+            value = source[index] + ratio * value
+            if index + 1 < keep:
+                ratios[index + 1] = ratio
+        if index < keep:
+            pivots[index], reduced[index] = pivot, value
+    psi = [reduced[0] / pivots[0]]
+    for index in range(1, keep):
+        psi.append(reduced[index] / pivots[index] + ratios[index] * psi[-1])
+    return np.stack(psi)
 
 
 def _amplitudes(k, m, moments, albedo, source_bands, order, first, last) -> np.ndarray:
-    """A^m_{l k'}(k): `[order, sources, nodes]`, zero below m; bounces first..last (None = all) over albedo^first."""
+    """A^m_{l k'}(k): `[order, sources, media, nodes]`, zero below m; bounces first..last (None = all) over albedo^first.
+
+    `albedo` is `[media, 1]` (every medium at every node) or `[1, nodes]` (each node has its own).
+    """
     bands = max(moments.size, order, max(source_bands) + 1, m + 1) - m
-    chi = np.zeros(bands)
-    chi[: max(moments.size - m, 0)] = moments[m:]
-    tail = _tails(k, m, m + bands)
-    source = np.zeros((bands, len(source_bands), k.size), dtype=complex)
-    for column, band in enumerate(source_bands):
-        if band >= m:
-            source[band - m, column] = 1
-    free = np.ones(bands)
-    psi = _solve(k, m, free, tail, source)
-    for _ in range(first - 1):
-        psi = _solve(k, m, free, tail, chi[:, None, None] * psi)
-    if last is None:
-        total = _solve(k, m, 1 - albedo * chi, tail, chi[:, None, None] * psi)
-    else:
-        total = 0
-        for bounce in range(first, last + 1):
-            psi = _solve(k, m, free, tail, chi[:, None, None] * psi)
-            total = total + albedo ** (bounce - first) * psi
-    amplitudes = np.zeros((order, len(source_bands), k.size), dtype=complex)
-    count = min(order - m, bands)
-    amplitudes[m : m + count] = total[:count]
+    chi = np.zeros((bands, 1, 1, 1))
+    chi[: max(moments.size - m, 0), 0, 0, 0] = moments[m:]
+    keep = min(order - m, bands)
+    amplitudes = np.zeros((order, len(source_bands), *np.broadcast_shapes(albedo.shape, (1, k.size))), dtype=complex)
+    for start in range(0, k.size, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        nodes = k[part]
+        loss = albedo if albedo.shape[1] == 1 else albedo[:, part]
+        tail = _tails(nodes, m, m + bands)
+        source = np.zeros((bands, len(source_bands), 1, 1))
+        for column, band in enumerate(source_bands):
+            if band >= m:
+                source[band - m, column] = 1
+        free = np.ones((bands, 1, 1))
+        psi = _solve(nodes, m, free, tail, source)
+        for _ in range(first - 1):
+            psi = _solve(nodes, m, free, tail, chi * psi)
+        if last is None:
+            total = _solve(nodes, m, 1 - loss * chi[:, 0], tail, chi * psi, keep=keep)
+        else:
+            total = 0
+            for bounce in range(first, last + 1):
+                psi = _solve(nodes, m, free, tail, chi * psi)
+                total = total + loss ** (bounce - first) * psi[:keep]
+        amplitudes[m : m + keep, ..., part] = total
     return amplitudes
 
 
-def diffusion_roots(moments: np.ndarray, albedo: np.ndarray) -> np.ndarray:
-    """kappa_0 of many media at once; `moments` `[*batch, J]`, `albedo` `[*batch]`. See `diffusion_root`."""
+def diffusion_roots(moments: np.ndarray, albedo: np.ndarray, *, num_steps: int = 48) -> np.ndarray:
+    """kappa_0 of many media at once; `moments` `[*batch, J]`, `albedo` `[*batch]`. See `diffusion_root`.
+
+    By bisection, from below: low by at most 2^-num_steps.
+    """
     moments, albedo = np.asarray(moments, dtype=np.float64), np.asarray(albedo, dtype=np.float64)
     bands = moments.shape[-1]
 
@@ -131,7 +152,7 @@ def diffusion_roots(moments: np.ndarray, albedo: np.ndarray) -> np.ndarray:
 
     low, high = np.zeros(albedo.shape), np.full(albedo.shape, 1 - 1e-12)
     none = definite(high)
-    for _ in range(48):
+    for _ in range(num_steps):
         middle = (low + high) / 2
         inside = definite(middle)
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
@@ -153,6 +174,7 @@ def _wigner(degree: int, beta: np.ndarray) -> np.ndarray:
     return np.einsum("ij,bj,kj->bik", vector, phases, vector.conj()).real
 
 
+@cache
 def _weights(order: int, source_bands: tuple[int, ...]) -> dict:
     """W^L summed over +-m': {(l, k', m): [(L, m', weight)]}."""
     mu, weight = leggauss(order + max(source_bands) + 2)
@@ -193,111 +215,145 @@ def _panels(edges: np.ndarray, num: int) -> tuple[np.ndarray, np.ndarray]:
     return (edges[:-1, None] + half * (1 + node)).ravel(), (half * weight).ravel()
 
 
-def _paths(tau: np.ndarray, kappa: float):
-    """Groups of radii with their integration paths: (indices, k, weights, is_real).
+def _near_paths(tau: np.ndarray, kappa: float):
+    """Paths for radii up to 4, shared by all media whose root is at least kappa: (real axis, vertical groups).
 
-    Radii above 4: from i a upward at 45 degrees, a just below the lowest singularity, so that e^{-a r} is factored out.
-    Smaller radii: along the real axis to k1, a power of 4 near 16 / r, with j_L, then straight up with h_L, which decays
-    there. All radii share the real axis; its nodes below k1 resolve the pole at i kappa.
+    Along the real axis to k1, a power of 4 near 16 / r, with j_L, then straight up with h_L, which decays there. All radii
+    share the real axis (nodes, weights, ends `[T]`); its nodes below k1 resolve the pole at i kappa. Groups are
+    (radii, nodes, weights).
     """
-    groups = []
-    far = np.flatnonzero(tau > 4)
-    if far.size:
-        gap = 0.2 * kappa
-        reach = 40 / (sqrt(0.5) * tau[far].min())
-        edges = np.concatenate([[0.0], gap * 2.0 ** np.arange(np.ceil(np.log2(reach / gap)) + 1)])
-        t, weight = _panels(edges, 20)
-        slope = np.exp(0.25j * pi)
-        groups.append((far, 1j * 0.8 * kappa + slope * t, slope * weight))
-    near = np.flatnonzero(tau <= 4)
-    exponent = 2 * np.round(np.log2(16 / tau[near]) / 2).astype(int)
+    exponent = 2 * np.round(np.log2(16 / tau) / 2).astype(int)
     t, t_weight = _panels(np.array([0.0, 1, 3, 8, 18, 40]), 14)
+    groups = []
     for step in np.unique(exponent):
-        radii = near[exponent == step]
         corner, scale = 2.0**step, 2.0**step / 16
-        groups.append((radii, corner + 1j * scale * t, 1j * scale * t_weight))
-    if near.size:
-        start = min(-4, int(np.floor(np.log2(0.25 * kappa))))
-        edges = np.concatenate([[0.0], 2.0 ** np.arange(start, exponent.max() + 1)])
-        real = _panels(edges, 32)
-        limits = 2.0**exponent
-    else:
-        real, limits = (np.empty(0), np.empty(0)), np.empty(0)
-    return groups, near, real, limits
+        groups.append((np.flatnonzero(exponent == step), corner + 1j * scale * t, 1j * scale * t_weight))
+    start = min(-4, int(np.floor(np.log2(0.25 * kappa))))
+    edges = np.concatenate([[0.0], 2.0 ** np.arange(start, exponent.max() + 1)])
+    return (*_panels(edges, 32), 2.0**exponent), groups
+
+
+def _far_path(tau: np.ndarray, kappa: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights for radii above 4: from i a upward at 45 degrees, a just below the lowest singularity.
+
+    So e^{-a r} is factored out.
+    """
+    gap = 0.2 * kappa
+    reach = 40 / (sqrt(0.5) * tau.min())
+    edges = np.concatenate([[0.0], gap * 2.0 ** np.arange(np.ceil(np.log2(reach / gap)) + 1)])
+    t, weight = _panels(edges, 20)
+    slope = np.exp(0.25j * pi)
+    return 1j * 0.8 * kappa + slope * t, slope * weight
+
+
+class _Sum:
+    """Adds up sum over nodes of k^2 i^L j_L(k r) A(k), for every (L, m', l, k') that the response needs."""
+
+    def __init__(self, weights: dict, source_bands: tuple[int, ...], num_azimuthal: int, shape: tuple[int, ...]):
+        pairs = {}
+        for (band, column, _), terms in weights.items():
+            for rank, inner, _ in terms:
+                if inner < num_azimuthal:
+                    pairs.setdefault((rank, inner), {})[band, column] = None
+        self.pairs = {key: list(value) for key, value in pairs.items()}
+        self.values = {(*key, *pair): np.zeros(shape) for key, found in self.pairs.items() for pair in found}
+
+    def add(self, radii, media, waves, factor, amplitudes) -> None:
+        """`waves[L]` `[R, nodes]`, `factor` `[nodes]` or `[R, nodes]`, `amplitudes[m']` `[order, sources, C, nodes]`."""
+        where = np.ix_(media, radii)
+        for (rank, inner), pairs in self.pairs.items():
+            bands, columns = zip(*pairs, strict=True)
+            chosen = amplitudes[inner][list(bands), list(columns)]
+            sums = (1j**rank * (chosen @ (waves[rank] * factor).T)).real  # [pairs, C, R]
+            for pair, value in zip(pairs, sums, strict=True):
+                self.values[(rank, inner, *pair)][where] += value
 
 
 def moment_responses(
     tau,
     *,
     moments: np.ndarray,
-    albedo: float,
+    albedo,
     source_bands: tuple[int, ...] = (0,),
     order: int = 11,
     first: int = 2,
     last: int | None = None,
-    kappa: float | None = None,
+    kappa=None,
 ) -> np.ndarray:
-    """R_{l k' m}(tau) / albedo^first: response of receiver band l to source emission y_{k'm}, `[T, order, sources, M]`.
+    """R_{l k' m}(tau) / albedo^first: response of receiver band l to source emission y_{k'm}, `[*media, T, order, sources, M]`.
 
     Bounces first..last (n = number of scatterings), last = None for the infinite sum; sigma_t = 1. Bands l describe the
     incident radiance as a function of the direction toward the light, axis receiver -> source; sources emit y_{k'm} about the
-    axis source -> receiver; m >= 0, M = max m + 1; both frames share x. albedo in [0, 1), or <= 1 where last is given.
-    kappa = the infinite sum's `diffusion_root` where the caller knows it already.
+    axis source -> receiver; m >= 0, M = max m + 1; both frames share x. albedo in [0, 1), or <= 1 where last is given: a number
+    or a vector, one entry per medium (media share moments and most of the work).
+    kappa = the infinite sum's `diffusion_roots` where the caller knows them already, shaped like albedo.
     """
     tau = np.atleast_1d(np.asarray(tau, dtype=np.float64))
     if not np.all(tau > 0):
         raise ValueError("tau must be > 0")
     if first < 1 or (last is not None and last < first):
         raise ValueError(f"bounces {first}..{last} must satisfy 1 <= first <= last")
-    if not 0 <= albedo < 1 and not (albedo == 1 and last is not None):
-        raise ValueError(f"albedo = {albedo} must lie in [0, 1) for the infinite sum, [0, 1] for single bounces")
+    scalar = np.ndim(albedo) == 0
+    albedo = np.atleast_1d(np.asarray(albedo, dtype=np.float64))
+    for value in albedo:
+        if not 0 <= value < 1 and not (value == 1 and last is not None):
+            raise ValueError(f"albedo = {value} must lie in [0, 1) for the infinite sum, [0, 1] for single bounces")
     moments = np.asarray(moments, dtype=np.float64)
-    if last is not None or albedo == 0:
-        kappa = 1.0  # single bounces have no poles
+    if last is not None:
+        kappa = np.ones(albedo.size)  # single bounces have no poles
     elif kappa is None:
-        kappa = diffusion_root(moments, albedo)
-    groups, near, (real, real_weight), limits = _paths(tau, kappa)
+        kappa = diffusion_roots(np.broadcast_to(moments, (albedo.size, moments.size)), albedo)
+    kappa = np.where(albedo == 0, 1.0, np.atleast_1d(kappa))
     weights = _weights(order, source_bands)
     num_azimuthal = min(order - 1, max(source_bands)) + 1
     scattered_azimuthal = min(num_azimuthal, moments.size)  # chi_m = 0 beyond: nothing scatters there
-    k = np.concatenate([real.astype(complex), *(group[1] for group in groups)])
-    amplitudes = [_amplitudes(k, m, moments, albedo, source_bands, order, first, last) for m in range(scattered_azimuthal)]
-    response = np.zeros((tau.size, order, len(source_bands), num_azimuthal))
-
-    def add(radii, wave, part, weight, inside):
-        factor = weight * k[part] ** 2
-        for (band, column, m), terms in weights.items():
-            by_rank = {}
-            for rank, inner, value in terms:
-                if inner < scattered_azimuthal:
-                    by_rank[rank] = by_rank.get(rank, 0) + value * amplitudes[inner][band, column, part]
-            for rank, amplitude in by_rank.items():
-                integrand = (1j**rank * factor * amplitude) * wave[rank]
-                response[radii, band, column, m] += np.where(inside, integrand, 0).real.sum(axis=1) / (2 * pi**2) * (-1) ** m
-
     max_rank = order - 1 + max(source_bands)
+    total = _Sum(weights, source_bands, scattered_azimuthal, (albedo.size, tau.size))
+
+    def amplitudes(k, albedos):
+        return [_amplitudes(k, m, moments, albedos, source_bands, order, first, last) for m in range(scattered_azimuthal)]
+
+    media = np.arange(albedo.size)
+    near, far = np.flatnonzero(tau <= 4), np.flatnonzero(tau > 4)
     if near.size:
-        part = slice(0, real.size)
-        wave = [spherical_jn(rank, np.outer(tau[near], real)) for rank in range(max_rank + 1)]
-        add(near, wave, part, real_weight, real < limits[:, None])
-    start = real.size
-    for radii, nodes, weight in groups:
-        part = slice(start, start + nodes.size)
-        add(radii, _hankel(max_rank, np.outer(tau[radii], nodes)), part, weight, True)
-        start += nodes.size
-    return response
+        (real, real_weight, limits), groups = _near_paths(tau[near], kappa.min())
+        found = amplitudes(np.concatenate([real.astype(complex), *(nodes for _, nodes, _ in groups)]), albedo[:, None])
+        waves = [spherical_jn(rank, np.outer(tau[near], real)) for rank in range(max_rank + 1)]
+        inside = real < limits[:, None]
+        total.add(near, media, waves, real_weight * real**2 * inside, [a[..., : real.size] for a in found])
+        start = real.size
+        for radii, nodes, weight in groups:
+            part = [a[..., start : start + nodes.size] for a in found]
+            total.add(near[radii], media, _hankel(max_rank, np.outer(tau[near[radii]], nodes)), weight * nodes**2, part)
+            start += nodes.size
+    if far.size:
+        paths = [_far_path(tau[far], value) for value in kappa]
+        own = np.repeat(albedo, [nodes.size for nodes, _ in paths])
+        found = amplitudes(np.concatenate([nodes for nodes, _ in paths]), own[None])
+        start = 0
+        for medium, (nodes, weight) in enumerate(paths):
+            part = [a[..., start : start + nodes.size] for a in found]
+            total.add(far, [medium], _hankel(max_rank, np.outer(tau[far], nodes)), weight * nodes**2, part)
+            start += nodes.size
+    response = np.zeros((albedo.size, tau.size, order, len(source_bands), num_azimuthal))
+    for (band, column, m), terms in weights.items():
+        for rank, inner, value in terms:
+            if inner < scattered_azimuthal:
+                share = (-1) ** m * value / (2 * pi**2)
+                response[:, :, band, column, m] += share * total.values[rank, inner, band, column]
+    return response[0] if scalar else response
 
 
 def point_table(
     tau,
     *,
     moments: np.ndarray,
-    albedo: float,
+    albedo,
     order: int = 11,
     first: int = 2,
     last: int | None = None,
-    kappa: float | None = None,
+    kappa=None,
 ) -> np.ndarray:
-    """L_l(tau) / albedo^first of a point source of intensity 1, bounces first..last: `[T, order]`, sigma_t = 1."""
+    """L_l(tau) / albedo^first of a point source of intensity 1, bounces first..last: `[*media, T, order]`, sigma_t = 1."""
     response = moment_responses(tau, moments=moments, albedo=albedo, order=order, first=first, last=last, kappa=kappa)
-    return sqrt(4 * pi) * response[:, :, 0, 0]
+    return sqrt(4 * pi) * response[..., 0, 0]
