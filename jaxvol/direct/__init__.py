@@ -32,6 +32,7 @@ from jaxvol.types import Camera, Estimate, Layers, Rays, Scene
 
 __all__ = ["Plan", "claims", "plan", "radiance", "render"]
 
+_VIEW = 192  # rays that stand for the picture where tables are made for it
 _NAMES = ("emission", "surface_from_light", "volume_from_light")
 
 
@@ -41,7 +42,9 @@ def radiance(scene: Scene, rays: Rays, plan: Plan, *, seed: int = 0, caster: ray
     def make_rays(item, sample):
         return jax.tree.map(lambda x: jnp.asarray(x)[item], rays)
 
-    return _average(context(scene, plan, caster=caster), make_rays, rays.t_max.shape[0], seed, None, None)
+    some = np.linspace(0, rays.t_max.shape[0] - 1, min(_VIEW, rays.t_max.shape[0])).astype(int)
+    view = jax.tree.map(lambda x: jnp.asarray(x)[some], rays)
+    return _average(context(scene, plan, view, caster=caster), make_rays, rays.t_max.shape[0], seed, None, None)
 
 
 def render(
@@ -55,7 +58,9 @@ def render(
     on_stage: Callable[[str], None] | None = None,
 ) -> Estimate:
     """The three layers of a picture, each pixel averaged over its square; no variance. `auxiliary` is filled."""
-    kit = context(scene, plan, caster=caster)
+    kit = context(scene, plan, _some_rays(camera), caster=caster)
+    if on_stage is not None:
+        on_stage("tables")
 
     def make_rays(item, sample):
         lattice = patterns.pixel_lattice(int(sample[-1]) + 1)[sample]
@@ -67,6 +72,13 @@ def render(
     if on_stage is not None:
         on_stage("auxiliary")
     return Estimate(mean=layers, auxiliary=guides)
+
+
+@jax.jit
+def _some_rays(camera):
+    """Rays all over the picture, 16 across and 12 down."""
+    x, y = jnp.meshgrid((jnp.arange(16) + 0.5) / 16 * camera.width, (jnp.arange(12) + 0.5) / 12 * camera.height)
+    return cameras.generate_rays(camera, jnp.stack([x.reshape(-1), y.reshape(-1)], axis=-1))
 
 
 @jax.jit

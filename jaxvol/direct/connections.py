@@ -4,6 +4,7 @@ A scene's lights are visited one by one: a `LightRun` is a scene with a single l
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxvol import extinction, ray_casting, segments
+from jaxvol import extinction, materials, ray_casting, segments
 from jaxvol.direct.emitters import Emitters, emitters
 from jaxvol.direct.light_columns import LightColumns, light_columns
 from jaxvol.direct.light_columns import optical_thickness as from_columns
-from jaxvol.types import Scene
+from jaxvol.direct.sky_field import SkyField, sky_field
+from jaxvol.direct.sky_sampling import cosine_weight, guided, phase_weight
+from jaxvol.types import EnvironmentLight, Rays, Scene
 
 _NEAR = 1.0 - 1e-4  # shadow rays stop short of a light that is itself a surface
 _FIELDS = {
@@ -45,6 +48,9 @@ class LightRun:
     kind: str
     scene: Scene
     emitters: Emitters | None = None  # of the kind "area" when there are few faces
+    guide: EnvironmentLight | None = None  # of the kind "environment": draws directions at points of the medium,
+    surface_guide: EnvironmentLight | None = None  # on surfaces
+    field: SkyField | None = None  # of the kind "environment" where the plan asks for it
     columns: LightColumns | None = None  # of the kind "directional" when the medium is one box with a grid
 
 
@@ -60,8 +66,10 @@ class Context:
     lights: tuple[LightRun, ...]
 
 
-def light_runs(scene: Scene, marching: extinction.MarchingMedium | None) -> tuple[LightRun, ...]:
-    """Every light of the scene by itself; eager."""
+def light_runs(
+    scene: Scene, marching: extinction.MarchingMedium | None, plan: Any, view: Rays, caster: ray_casting.Caster
+) -> tuple[LightRun, ...]:
+    """Every light of the scene by itself, with tables for the picture that `view` has a few rays of; eager."""
     gridded = marching is not None and segments.is_box(scene.medium) and scene.medium.density is not None
     runs = []
     bare = Scene(mesh=scene.mesh)
@@ -77,24 +85,51 @@ def light_runs(scene: Scene, marching: extinction.MarchingMedium | None) -> tupl
         for light in alone:
             faces = emitters(scene) if kind == "area" else None
             columns = light_columns(marching, light.direction[0]) if kind == "directional" and gridded else None
-            runs.append(LightRun(kind, _with(bare, field, light), faces, columns))
+            sky = {}
+            if kind == "environment":
+                sky = _sky_tables(scene, marching, plan, view, caster)
+            runs.append(LightRun(kind, _with(bare, field, light), emitters=faces, columns=columns, **sky))
     return tuple(runs)
+
+
+def _sky_tables(scene, marching, plan, view, caster):
+    """Samplers of the environment for the directions and the surfaces that the picture shows, and the field."""
+    sky, found = scene.environment, {}
+    if plan.volume:
+        found["guide"] = guided(sky, partial(phase_weight, marching.regions, view.direction))
+    if plan.surface:
+        t, face = ray_casting.intersect(caster, view.origin, view.direction, view.t_max)
+        hits = ray_casting.hits(scene.mesh, view.origin, view.direction, t, face)
+        normal = np.asarray(materials.facing_normal(hits.normal, view.direction))
+        normal = np.where(np.asarray(hits.valid)[:, None], normal, 0.0)
+        found["surface_guide"] = guided(sky, partial(cosine_weight, jnp.asarray(normal)))
+    if plan.num_sky_directions:
+        found["field"] = sky_field(
+            scene,
+            marching,
+            found["guide"],
+            np.asarray(view.origin)[0],
+            num_directions=plan.num_sky_directions,
+            caster=caster,
+        )
+    return found
 
 
 def _with(scene, field, value):
     return eqx.tree_at(lambda s: getattr(s, field), scene, value, is_leaf=lambda x: x is None)
 
 
-def context(scene: Scene, plan: Any, *, caster: ray_casting.Caster = None) -> Context:
-    """Casters and tables for a scene; eager. The caster of the mesh may be given."""
+def context(scene: Scene, plan: Any, view: Rays, *, caster: ray_casting.Caster = None) -> Context:
+    """Casters and tables for a scene and a few rays of the picture; eager. The caster of the mesh may be given."""
+    caster = ray_casting.caster_for(scene.mesh) if caster is None else caster
     marching = None if scene.medium is None else extinction.marching_medium(scene.medium)
     return Context(
         scene=scene,
         plan=plan,
-        caster=ray_casting.caster_for(scene.mesh) if caster is None else caster,
+        caster=caster,
         medium_casters=segments.medium_casters(scene.medium),
         marching=marching,
-        lights=light_runs(scene, marching),
+        lights=light_runs(scene, marching, plan, view, caster),
     )
 
 

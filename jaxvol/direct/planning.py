@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxvol import extinction, lights, media
+from jaxvol import extinction, lights, media, segments
 from jaxvol.layers import Claim
 from jaxvol.types import Camera, Mesh, Scene
 
 _MOST_STEPS = 256
+_THICK_VOXEL = 1.2  # optical thickness beyond which light from the sky changes too fast from voxel to voxel
+_PEAKED = 0.8  # mean cosine beyond which a few hundred directions of the sky miss the peak
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class Plan:
     num_environment_steps: int  # nodes on an eye ray, each with a direction
     num_bsdf_samples: int  # per eye ray at a surface, for emissive faces and the environment
     num_phase_steps: int  # nodes with a direction from the phase function, for the environment
+    num_sky_directions: int  # swept for a field of light from the environment (`sky_field`); 0: every node marches
+    num_field_steps: int  # nodes on an eye ray in that field
     num_light_steps: int  # marching steps towards a light, through a grid
     rays_per_chunk: int
     skipped: tuple[str, ...]  # what was skipped and why
@@ -56,6 +60,8 @@ def plan(
     num_environment_steps: int | None = None,
     num_bsdf_samples: int | None = None,
     num_phase_steps: int | None = None,
+    num_sky_directions: int | None = None,
+    num_field_steps: int = 8,
     num_light_steps: int | None = None,
     rays_per_chunk: int = 1 << 15,
     specialize: str = "values",
@@ -82,6 +88,8 @@ def plan(
         "num_environment_steps": (num_environment_steps, 0, 4096),
         "num_bsdf_samples": (num_bsdf_samples, 0, 4096),
         "num_phase_steps": (num_phase_steps, 0, 4096),
+        "num_sky_directions": (num_sky_directions, 0, 65536),
+        "num_field_steps": (num_field_steps, 1, 4096),
         "num_light_steps": (num_light_steps, 1, 4096),
         "rays_per_chunk": (rays_per_chunk, 1, 1 << 24),
     }
@@ -93,6 +101,10 @@ def plan(
     across = 0 if scene.medium is None else extinction.num_voxels_across(scene.medium)
     # A map with a sun in it needs more directions than a sky of one radiance; without a grid they cost little.
     is_map = scene.environment is not None and scene.environment.radiance.shape[:2] != (1, 1)
+    if num_sky_directions is None:
+        num_sky_directions = 384
+    if not (volume and _has_field(scene, camera)):
+        num_sky_directions = 0
     if num_environment_samples is None:
         num_environment_samples = 40 if is_map else 12
     if num_environment_steps is None:
@@ -126,6 +138,8 @@ def plan(
         num_environment_steps=num_environment_steps,
         num_bsdf_samples=num_bsdf_samples,
         num_phase_steps=num_phase_steps,
+        num_sky_directions=num_sky_directions,
+        num_field_steps=num_field_steps,
         num_light_steps=num_light_steps or min(max(-(-across // 2), 1), _MOST_STEPS),
         rays_per_chunk=rays_per_chunk,
         skipped=skipped,
@@ -141,6 +155,35 @@ def _refuse_refraction(scene: Scene) -> None:
     ):
         if medium.ior is not None and np.any(np.asarray(medium.ior) != 1.0):
             raise ValueError(f"{name}.refractive_index must be 1 for direct light, whose rays are straight")
+
+
+def _has_field(scene: Scene, camera: Camera | None) -> bool:
+    """Whether light from the environment may be swept: a box with a grid, the eye and all surfaces outside it."""
+    if scene.environment is None or camera is None or scene.medium.density is None or not segments.is_box(scene.medium):
+        return False
+    low, high = np.asarray(scene.medium.bounds, np.float64)
+    eye = np.asarray(camera.world_from_camera, np.float64)[:3, 3]
+    if np.all((eye >= low) & (eye <= high)):
+        return False
+    if not _is_smooth(scene.medium):
+        return False
+    if scene.mesh is None:
+        return True
+    corners = np.asarray(scene.mesh.vertices, np.float64)[np.asarray(scene.mesh.faces)]
+    inside = (corners.max(axis=1) > low) & (corners.min(axis=1) < high)
+    return not np.any(np.all(inside, axis=1))
+
+
+def _is_smooth(medium) -> bool:
+    """Whether light from the sky can be interpolated between voxels (optical thickness of nearly all of them below
+    about one) and found by a few hundred directions (a phase function that is not too peaked)."""
+    density = np.asarray(medium.density)
+    voxel = np.ptp(np.asarray(medium.bounds, np.float64), axis=0) / density.shape
+    filled = density[density > 0]
+    if filled.size == 0:
+        return False
+    thickness = np.percentile(filled, 99) * float(np.max(np.asarray(media.sigma_t(medium)))) * voxel.max()
+    return bool(thickness <= _THICK_VOXEL) and abs(float(medium.g)) <= _PEAKED
 
 
 def _default_bsdf_samples(scene: Scene) -> int:

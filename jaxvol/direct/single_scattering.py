@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxvol import lights, media, phase, segments
 from jaxvol.direct import cells as ray_cells
-from jaxvol.direct import emitters, patterns
+from jaxvol.direct import emitters, patterns, sky_field
 from jaxvol.direct.connections import Connections, Context, LightRun, bucket, resolve
 from jaxvol.sampling import dot
 from jaxvol.types import Rays
@@ -51,6 +51,10 @@ def scattered_light(
     cells = _cut(context.marching, origin, direction, t0, t1, borders, region, num_cells=plan.num_cells)
     total = jnp.zeros(origin.shape, jnp.float32)
     for run in context.lights:
+        if run.field is not None:
+            sizes = {"num_steps": plan.num_field_steps, "num_samples": num_samples}
+            total = total + _from_field(context.marching, run.field, cells, origin, direction, sample, **sizes)
+            continue
         for connections in _connections(context, run, cells, origin, direction, pixel, sample, seed, num_samples):
             total = total + resolve(context, run, connections)
     result[chosen] = np.asarray(total)[: chosen.size]
@@ -87,6 +91,7 @@ def _connections(context: Context, run: LightRun, cells, origin, direction, pixe
     """The sets of connections that one light wants, one after the other."""
     plan = context.plan
     data = (context.marching, run.scene, cells, origin, direction, pixel, sample, seed)
+    guide = {"guide": run.guide}
     if run.kind in ("point", "spot"):
         yield _to_point(*data, 0, kind=run.kind, num_steps=plan.num_steps, num_points=1, num_samples=num_samples)
     elif run.kind == "directional":
@@ -100,9 +105,9 @@ def _connections(context: Context, run: LightRun, cells, origin, direction, pixe
     else:
         sizes = {"num_samples": num_samples, "num_phase": plan.num_phase_steps}
         if plan.num_environment_steps:
-            yield _to_sky(*data, num_steps=plan.num_environment_steps, directional=False, **sizes)
+            yield _to_sky(*data, num_steps=plan.num_environment_steps, directional=False, **guide, **sizes)
         if plan.num_phase_steps:
-            yield _along_phase(*data, num_steps=plan.num_environment_steps, **sizes)
+            yield _along_phase(*data, num_steps=plan.num_environment_steps, **guide, **sizes)
 
 
 def _phase(marching, region, cos_theta):
@@ -203,22 +208,50 @@ def _to_emitters(
 
 @partial(jax.jit, static_argnames=("num_steps", "num_samples", "num_phase", "directional"))
 def _to_sky(
-    marching, scene, cells, origin, direction, pixel, sample, seed, *, num_steps, num_samples, num_phase, directional
+    marching,
+    scene,
+    cells,
+    origin,
+    direction,
+    pixel,
+    sample,
+    seed,
+    *,
+    guide=None,
+    num_steps,
+    num_samples,
+    num_phase,
+    directional,
 ) -> Connections:
     """Towards a directional light, or in directions drawn from the environment, a new one at each node."""
     nodes, u1, u2 = _sky_nodes(marching, cells, pixel, sample, seed, num_steps, num_samples, _SKY_SET)
     points = origin + nodes.t[..., None] * direction
-    light = lights.sample_light(scene, points, u1, u2, u2)
-    weight = 1.0 / light.pdf
-    if num_phase and not directional:
-        other = _phase(marching, nodes.region, dot(light.direction, direction))
-        weight = num_steps / (num_steps * light.pdf + num_phase * other)
-    return _finish(marching, nodes, direction, light, weight, points)
+    if directional:
+        light = lights.sample_light(scene, points, u1, u2, u2)
+        return _finish(marching, nodes, direction, light, 1.0, points)
+    towards, pdf = lights.sample_environment(guide, u1, u2)
+    towards_eye = _phase(marching, nodes.region, dot(towards, direction))
+    weight = towards_eye * num_steps / (num_steps * pdf + num_phase * towards_eye)
+    return _to_infinity(nodes, points, towards, lights.environment_radiance(scene.environment, towards) * weight[..., None])
+
+
+def _to_infinity(nodes, points, towards, light):
+    return Connections(points, towards, jnp.full(nodes.t.shape, jnp.inf, jnp.float32), nodes.weight * light)
+
+
+@partial(jax.jit, static_argnames=("num_steps", "num_samples"))
+def _from_field(marching, field, cells, origin, direction, sample, *, num_steps, num_samples):
+    """Light from the environment, looked up at nodes by transmittance."""
+    shift = patterns.step_shift(sample, num_samples)
+    u = (jnp.arange(num_steps, dtype=jnp.float32)[:, None] + shift) / num_steps
+    nodes = ray_cells.place(marching, cells, u)
+    points = origin + nodes.t[..., None] * direction
+    return jnp.sum(nodes.weight * sky_field.scattered_radiance(field, points), axis=0)
 
 
 @partial(jax.jit, static_argnames=("num_steps", "num_samples", "num_phase"))
 def _along_phase(
-    marching, scene, cells, origin, direction, pixel, sample, seed, *, num_steps, num_samples, num_phase
+    marching, scene, cells, origin, direction, pixel, sample, seed, *, guide, num_steps, num_samples, num_phase
 ) -> Connections:
     """Towards the environment in directions drawn from the phase function (which is reciprocal)."""
     nodes, u1, u2 = _sky_nodes(marching, cells, pixel, sample, seed, num_phase, num_samples, _PHASE_SET)
@@ -228,9 +261,7 @@ def _along_phase(
         other, _ = phase.sample(medium, eye, u1, u2)
         towards = jnp.where((nodes.region == r)[..., None], other, towards)
     pdf = _phase(marching, nodes.region, dot(towards, eye))
-    sky = lights.sample_environment_pdf(scene.environment, towards)
+    sky = lights.sample_environment_pdf(guide, towards)
     weight = jnp.where(pdf > 0, pdf * num_phase / (num_phase * pdf + num_steps * sky), 0.0)
     radiance = lights.environment_radiance(scene.environment, towards)
-    points = origin + nodes.t[..., None] * direction
-    distance = jnp.full(pdf.shape, jnp.inf, jnp.float32)
-    return Connections(points, towards, distance, nodes.weight * radiance * weight[..., None])
+    return _to_infinity(nodes, origin + nodes.t[..., None] * direction, towards, radiance * weight[..., None])

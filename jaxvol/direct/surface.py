@@ -31,10 +31,10 @@ def surface_light(
         num_bsdf = 0 if run.kind in DELTA else plan.num_bsdf_samples
         sizes = {"num_light": num_light, "num_bsdf": num_bsdf, "kind": run.kind}
         if num_light:
-            towards = connect(run.scene, run.emitters, rays.direction, hits, pixel, sample, seed, **sizes)
+            towards = connect(run.scene, run.emitters, run.surface_guide, rays.direction, hits, pixel, sample, seed, **sizes)
             total = total + resolve(context, run, towards)
         if num_bsdf and run.kind == "environment":
-            along = connect_along_bsdf(run.scene, rays.direction, hits, pixel, sample, seed, **sizes)
+            along = connect_along_bsdf(run.scene, run.surface_guide, rays.direction, hits, pixel, sample, seed, **sizes)
             total = total + resolve(context, run, along)
         elif num_bsdf:
             total = total + _area_along_bsdf(context, run, rays.direction, hits, pixel, sample, seed, sizes)
@@ -66,7 +66,9 @@ def _reflected(surface, incoming, hits, normal, direction):
 
 
 @partial(jax.jit, static_argnames=("kind", "num_light", "num_bsdf"))
-def connect(scene, faces, incoming, hits, pixel, sample, seed, *, kind: str, num_light: int, num_bsdf: int) -> Connections:
+def connect(
+    scene, faces, guide, incoming, hits, pixel, sample, seed, *, kind: str, num_light: int, num_bsdf: int
+) -> Connections:
     """Connections from hits towards the scene's one light, the estimator's weights and BSDF multiplied in."""
     surface, normal, offset = _common(scene, incoming, hits)
     found = []
@@ -76,7 +78,7 @@ def connect(scene, faces, incoming, hits, pixel, sample, seed, *, kind: str, num
             light = emitters.sample(faces, hits.position, *patterns.shifted(seed, pixel, index, _LIGHT_SET, 2))
         elif kind == "environment":
             u1, u2 = patterns.shifted(seed, pixel, index, _LIGHT_SET, 2)
-            light = lights.sample_light(scene, hits.position, u1, u2, u2)
+            light = _sample_sky(scene.environment, guide, u1, u2)
         else:
             light = lights.sample_light(scene, hits.position, *patterns.shifted(seed, pixel, index, _LIGHT_SET, 3))
         weight = 1.0 / (num_light * jnp.where(light.pdf > 0, light.pdf, 1.0))
@@ -87,6 +89,14 @@ def connect(scene, faces, incoming, hits, pixel, sample, seed, *, kind: str, num
         value = _reflected(surface, incoming, hits, normal, light.direction) * light.radiance * weight[:, None]
         found.append((*_aim(offset(light.direction), light), value))
     return Connections(*(jnp.stack(part) for part in zip(*found, strict=True)))
+
+
+def _sample_sky(environment, guide, u1, u2):
+    """A direction drawn by the guide's table, with the environment's radiance."""
+    direction, pdf = lights.sample_environment(guide, u1, u2)
+    radiance = lights.environment_radiance(environment, direction)
+    infinite = jnp.full(pdf.shape, jnp.inf, jnp.float32)
+    return lights.LightSample(direction, infinite, radiance, pdf, jnp.zeros(pdf.shape, bool), 1e30 * direction)
 
 
 def _aim(origin, light):
@@ -106,13 +116,15 @@ def _bsdf_directions(surface, incoming, hits, pixel, sample, seed, k, num_bsdf):
 
 
 @partial(jax.jit, static_argnames=("kind", "num_light", "num_bsdf"))
-def connect_along_bsdf(scene, incoming, hits, pixel, sample, seed, *, kind: str, num_light: int, num_bsdf: int) -> Connections:
+def connect_along_bsdf(
+    scene, guide, incoming, hits, pixel, sample, seed, *, kind: str, num_light: int, num_bsdf: int
+) -> Connections:
     """Connections to the environment in directions sampled from the BSDF."""
     surface, normal, offset = _common(scene, incoming, hits)
     found = []
     for k in range(num_bsdf):
         direction, pdf = _bsdf_directions(surface, incoming, hits, pixel, sample, seed, k, num_bsdf)
-        other = lights.sample_environment_pdf(scene.environment, direction)
+        other = lights.sample_environment_pdf(guide, direction)
         weight = jnp.where(pdf > 0, 1.0 / (num_bsdf * pdf + num_light * other), 0.0)
         radiance = lights.environment_radiance(scene.environment, direction)
         value = _reflected(surface, incoming, hits, normal, direction) * radiance * weight[:, None]
