@@ -2,17 +2,21 @@
 
 Region 0 is the medium itself: its box, within its `boundary` mesh where it has one. Region i is its i-th inclusion,
 likewise. The last region that contains a point owns it; region -1 is vacuum. `segments` cuts rays into pieces of one
-region each; media without meshes take a closed form. Crossings come from any caster: with Embree casters everything
-runs in numpy on the host, with BVH or brute-force casters in JAX, jittable, from the same array code.
+region each; media without meshes take a closed form. Crossings come from any caster: with BVH or brute-force
+casters all is jittable, with Embree casters arrays come from and go to the host.
 """
 
+import functools
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxvol import media, ray_casting
-from jaxvol.ray_casting.closed_meshes import pack
+from jaxvol.ray_casting.closed_meshes import pack, padded
 from jaxvol.types import Medium
 
 _MOST_SEGMENTS = 16  # default limit; further pieces are rare and are reported
@@ -68,22 +72,36 @@ def segments(
         hit = t0 < t1
         t = jnp.where(hit[:, None], jnp.stack([t0, t1], 1), 0.0)
         return Segments(t=t, region=jnp.where(hit, 0, -1)[:, None], num_overflows=jnp.zeros((), jnp.int32))
-    xp = _array_module(casters)
-    origin, direction, t_max = (xp.asarray(x, np.float32) for x in (origin, direction, t_max))
+    on_host = any(isinstance(c, ray_casting.EmbreeCaster) for c in casters)
+    n = len(origin)
+    xp = np if on_host else jnp
+    rays = tuple(xp.asarray(x, np.float32) for x in (origin, direction, t_max))
+    if on_host:
+        rays = padded(*rays)
+    found = tuple(None if c is None else ray_casting.crossings(c, *rays, max_hits=max_hits) for c in casters)
+    boxes = tuple(part.bounds for part in regions)
+    most = 2 * sum(1 if c is None else (max_hits + 2) // 2 for c in casters) - 1
+    pieces = _assemble(boxes, found, *rays, min(most, _MOST_SEGMENTS) if max_segments is None else max_segments)
+    if not on_host:
+        return pieces
+    return Segments(np.asarray(pieces.t)[:n], np.asarray(pieces.region)[:n], np.asarray(pieces.num_overflows))
+
+
+@functools.partial(jax.jit, static_argnames=("max_segments",))
+def _assemble(boxes, found, origin, direction, t_max, max_segments):
+    """Pieces of rays from the crossings of each region's mesh (None: it fills its box)."""
     starts, ends, overflow = [], [], 0
-    for part, caster in zip(regions, casters, strict=True):
-        start, end = _box_interval(xp, part.bounds, origin, direction)
-        start, end = start[None], xp.minimum(end, t_max)[None]
-        if caster is not None:
-            found = ray_casting.crossings(caster, origin, direction, t_max, max_hits=max_hits)
-            overflow = overflow + found.num_overflows
-            entry, exit_ = _intervals(xp, found)
-            start, end = xp.maximum(start, entry), xp.minimum(end, exit_)
+    for bounds, crossed in zip(boxes, found, strict=True):
+        start, end = media.box_interval(bounds, origin, direction)
+        start, end = start[None], jnp.minimum(end, t_max)[None]
+        if crossed is not None:
+            overflow = overflow + crossed.num_overflows
+            entry, exit_ = _intervals(crossed)
+            start, end = jnp.maximum(start, entry), jnp.minimum(end, exit_)
         empty = ~(start < end)
-        starts.append(xp.where(empty, np.float32(np.inf), start))
-        ends.append(xp.where(empty, np.float32(np.inf), end))
-    most = 2 * sum(s.shape[0] for s in starts) - 1
-    return _cut(xp, starts, ends, overflow, min(most, _MOST_SEGMENTS) if max_segments is None else max_segments)
+        starts.append(jnp.where(empty, jnp.float32(jnp.inf), start))
+        ends.append(jnp.where(empty, jnp.float32(jnp.inf), end))
+    return _cut(starts, ends, overflow, max_segments)
 
 
 def region_at(medium: Medium, points: Float[Array, "n 3"], *, casters: tuple[ray_casting.Caster, ...]) -> Int[Array, "n"]:
@@ -124,55 +142,57 @@ def _array_module(casters):
     return np if any(isinstance(c, ray_casting.EmbreeCaster) for c in casters) else jnp
 
 
-def _box_interval(xp, bounds, origin, direction):
-    """`media.box_interval` for numpy or JAX arrays."""
-    bounds = xp.asarray(bounds, np.float32)
-    start, end = np.float32(0.0), np.float32(np.inf)
-    for i in range(3):
-        d = direction[:, i]
-        inverse = 1 / xp.where(xp.abs(d) < 1e-20, xp.where(d < 0, np.float32(-1e-20), np.float32(1e-20)), d)
-        a, b = (bounds[0, i] - origin[:, i]) * inverse, (bounds[1, i] - origin[:, i]) * inverse
-        start, end = xp.maximum(start, xp.minimum(a, b)), xp.minimum(end, xp.maximum(a, b))
-    return start, end
-
-
-def _intervals(xp, found):
+def _intervals(found):
     """(entry, exit) [J, n] of the intervals inside a mesh; entry = inf where there are no more, the last may stay open."""
     t = found.t.T
-    rest = xp.full_like(t[:1], np.inf)
-    ends = xp.where(found.inside, xp.concatenate([xp.zeros_like(rest), t]), xp.concatenate([t, rest]))
+    rest = jnp.full_like(t[:1], np.inf)
+    ends = jnp.where(found.inside, jnp.concatenate([jnp.zeros_like(rest), t]), jnp.concatenate([t, rest]))
     if len(ends) % 2:
-        ends = xp.concatenate([ends, rest])
+        ends = jnp.concatenate([ends, rest])
     return ends[0::2], ends[1::2]
 
 
-def _cut(xp, starts, ends, overflow, max_segments):
+def _sort_rows(t):
+    """Each column of [T, n] in increasing order, T small; exchanges of neighbours, since XLA's sort is slow on CPUs."""
+    rows = t.shape[0]
+    even, odd = rows // 2 * 2, (rows - 1) // 2 * 2 + 1
+
+    def exchange(t, first, end):
+        low, high = t[first:end:2], t[first + 1 : end : 2]
+        pairs = jnp.stack([jnp.minimum(low, high), jnp.maximum(low, high)], 1).reshape(end - first, -1)
+        return jnp.concatenate([t[:first], pairs, t[end:]])
+
+    return lax.fori_loop(0, rows // 2 + 1, lambda _, x: exchange(exchange(x, 0, even), 1, odd), t)
+
+
+def _cut(starts, ends, overflow, max_segments):
     """Pieces from the intervals [J_i, n] of each region i (inf, inf where there are no more); later regions win."""
-    t = xp.sort(xp.concatenate([*starts, *ends]), 0)
-    if xp is np:  # rays rarely use all rows
-        t = t[: 1 + np.count_nonzero(np.any(np.isfinite(t[1:]), 1))]
+    if len(starts) == 1:  # in order already
+        t = jnp.stack([starts[0], ends[0]], 1).reshape(-1, starts[0].shape[1])
+    else:
+        t = _sort_rows(jnp.concatenate([*starts, *ends]))
     low, high = t[:-1], t[1:]
-    owner = xp.full(low.shape, -1, np.int32)
+    owner = jnp.full(low.shape, -1, np.int32)
     for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        inside = xp.zeros(low.shape, bool)
+        inside = jnp.zeros(low.shape, bool)
         for j in range(len(start)):
             inside = inside | ((start[j] <= low) & (high <= end[j]))
-        owner = xp.where(inside, np.int32(i), owner)
-    exists = (low < high) & xp.isfinite(high)
-    begins, before = [], xp.full(t.shape[1], -2, np.int32)
+        owner = jnp.where(inside, np.int32(i), owner)
+    exists = (low < high) & jnp.isfinite(high)
+    begins, before = [], jnp.full(t.shape[1], -2, np.int32)
     for m in range(len(low)):
         begins.append(exists[m] & (owner[m] != before))
-        before = xp.where(exists[m], owner[m], before)
-    last = xp.max(xp.where(xp.isfinite(t), t, np.float32(0.0)), 0)
+        before = jnp.where(exists[m], owner[m], before)
+    last = jnp.max(jnp.where(jnp.isfinite(t), t, np.float32(0.0)), 0)
     if not begins:
-        begins = [xp.zeros(t.shape[1], bool)]
-        low, owner = t, xp.full(t.shape, -1, np.int32)
-    begins = xp.stack(begins)
-    row = xp.cumsum(begins, 0) - 1
-    out_t = pack(xp, begins, row, low, np.inf, max_segments + 1)
-    region = pack(xp, begins, row, owner, -1, max_segments)
+        begins = [jnp.zeros(t.shape[1], bool)]
+        low, owner = t, jnp.full(t.shape, -1, np.int32)
+    begins = jnp.stack(begins)
+    row = jnp.cumsum(begins, 0) - 1
+    out_t = pack(begins, row, low, np.inf, max_segments + 1)
+    region = pack(begins, row, owner, -1, max_segments)
     return Segments(
-        t=xp.minimum(out_t, last).T,
+        t=jnp.minimum(out_t, last).T,
         region=region.T,
-        num_overflows=overflow + xp.sum(row[-1] >= max_segments),
+        num_overflows=overflow + jnp.sum(row[-1] >= max_segments),
     )

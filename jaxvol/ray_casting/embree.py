@@ -5,12 +5,16 @@ arrays (JAX buffers are read-only, so those are copied once), has no t_near (cal
 interpreter lock while it casts, so that batches are cast by one thread per core.
 """
 
+import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
 
+import jax.numpy as jnp
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+
+from jaxvol.ray_casting.closed_meshes import Body
 
 _MIN_LANES_PER_THREAD = 4096  # below this a second thread costs more than it brings
 
@@ -20,13 +24,18 @@ class EmbreeCaster:
 
     def __init__(self, vertices, faces, triangles, normals, num_bodies: int, *, num_threads: int | None = None):
         self.scene = EmbreeScene(robust=True)
-        self.triangles = triangles  # [F, 3, 3]
-        self.normals = normals  # [F, 3], outward for a closed mesh
         self.num_bodies = num_bodies  # connected components of the mesh
+        self._arrays = normals, triangles  # [F, 3], outward for a closed mesh; [F, 3, 3]
         self.num_threads = num_threads or _num_cores()
         self._geometry = TriangleMesh(self.scene, np.array(vertices, np.float32), np.array(faces, np.int32))
         self._pool = ThreadPoolExecutor(self.num_threads) if self.num_threads > 1 else None
         self.scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # builds the hierarchy now
+
+    @functools.cached_property
+    def body(self) -> Body:
+        """What following rays through a closed mesh needs, on the device."""
+        normals, triangles = self._arrays
+        return Body(jnp.asarray(normals), jnp.asarray(triangles, jnp.float32), jnp.int32(self.num_bodies))
 
     def run(self, origin: np.ndarray, direction: np.ndarray, t_max: np.ndarray, **options) -> list:
         """What Embree answers, one entry per thread's share of the lanes. Writes into `t_max`."""

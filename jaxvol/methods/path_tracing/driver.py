@@ -6,7 +6,7 @@ and the same casting order run under `lax.while_loop`, which is what an accelera
 
 import threading
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -17,9 +17,9 @@ from jax import lax
 from jaxvol import ray_casting, segments
 from jaxvol.columns import by_columns, compiler_options, join, split
 from jaxvol.methods.path_tracing import sensors
-from jaxvol.methods.path_tracing.flight import mean_medium
+from jaxvol.methods.path_tracing.flight import homogeneous_reach, mean_medium
 from jaxvol.methods.path_tracing.lanes import Casts, Lanes, Settings, flush, flush_host, idle, num_columns, rows
-from jaxvol.methods.path_tracing.step import Work, step
+from jaxvol.methods.path_tracing.step import Work, flight_uniforms, step
 from jaxvol.ray_casting import EmbreeCaster
 from jaxvol.types import Scene
 
@@ -89,17 +89,46 @@ def _cut(scene, medium_casters, origin, direction, t_max, max_spans):
     return found.t, found.region
 
 
-def _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spans):
+@partial(jax.jit, static_argnames=("settings",))
+def _reach(medium, settings, seed, lanes):
+    """How far the path rays fly if they stay where they are; inf where spans are needed to tell."""
+    if settings.tracked or settings.equiangular:
+        return jnp.full(lanes.alive.shape, jnp.inf, jnp.float32)
+    u = flight_uniforms(seed, lanes)
+    lanes = join(lanes)
+    return homogeneous_reach(medium, lanes.region, lanes.origin, lanes.direction, lanes.throughput, u[0], u[1])
+
+
+def _cut_paths(scene, medium_casters, seed, lanes, casts, index, origin, direction, settings):
+    """Spans of new path rays, and how far these matter. Most flights in a dense body end before they leave it."""
+    times, regions = casts.path_spans
+    reach = np.asarray(_reach(scene.medium, settings, seed, lanes))[index] * np.float32(1 + 1e-4)
+    stays = np.isfinite(reach)
+    for caster in medium_casters:
+        some = np.flatnonzero(stays)
+        if caster is not None and some.size:
+            stays[some] = ~ray_casting.occluded(caster, origin[some], direction[some], reach[some])
+    inside = index[stays]
+    times[inside, 0], times[inside, 1:] = 0.0, reach[stays, None]
+    regions[inside, 0], regions[inside, 1:] = np.asarray(lanes.region)[inside], -1
+    far = np.where(stays, reach, np.float32(np.inf))
+    rest = ~stays
+    if np.any(rest):
+        cut = _cut(scene, medium_casters, origin[rest], direction[rest], far[rest], times.shape[1] - 1)
+        times[index[rest]], regions[index[rest]] = cut
+    return far
+
+
+def _cast_changed(scene, caster, medium_casters, seed, lanes, casts, settings, max_spans):
     """Host casting: only what is new, active and needed; numpy arrays, updated in place."""
     index = np.flatnonzero(np.asarray(lanes.recast) & np.asarray(lanes.alive))
     if index.size and (scene.mesh is not None or settings.bounded):
         origin, direction = rows(lanes.origin, index), rows(lanes.direction, index)
         far = np.full(index.size, np.inf, np.float32)
-    if scene.mesh is not None and index.size:
-        casts.t[index], casts.face[index] = ray_casting.intersect(caster, origin, direction, far)
-    if settings.bounded and index.size:
-        t, region = _cut(scene, medium_casters, origin, direction, far, max_spans)
-        casts.path_spans[0][index], casts.path_spans[1][index] = t, region
+        if settings.bounded:
+            far = _cut_paths(scene, medium_casters, seed, lanes, casts, index, origin, direction, settings)
+        if scene.mesh is not None:
+            casts.t[index], casts.face[index] = ray_casting.intersect(caster, origin, direction, far)
     for number, (shadow, recast) in enumerate(zip(lanes.shadows, lanes.recast_shadows, strict=True)):
         index = np.flatnonzero(np.asarray(shadow.active) & np.asarray(recast))
         if not index.size:
@@ -180,7 +209,7 @@ def run(
         with _COMPILING if count == 0 else nullcontext():  # threads that share a program compile it once
             lanes, work, ended, busy = one_step(scene, proxy, sensor, settings, seed, lanes, casts, work)
         flush_host(film, ended.sums, ended.finished, num_pixels, first_pixel)
-        casts = _cast_changed(scene, caster, medium_casters, lanes, casts, settings, max_spans)
+        casts = _cast_changed(scene, caster, medium_casters, seed, lanes, casts, settings, max_spans)
         count += 1
         if on_step is not None and count % 16 == 0:
             on_step(min(int(work.next), items) / items)

@@ -113,6 +113,21 @@ def sample_homogeneous(medium: Medium, spans: Spans, throughput: Float[Array, "n
     return t, collided, region, weight, pdf
 
 
+def homogeneous_reach(medium: Medium, region: Int[Array, "n"], origin, direction, throughput, u_channel, u_flight):
+    """Length of the flight that `sample_homogeneous` chooses if the ray stays in the medium where it starts.
+
+    inf where that is unknown (region -1) or where the ray crosses the box of any medium before.
+    """
+    hero = choose_channel(throughput, u_channel)[0]
+    sigma = pick(span_sigma(medium, region), hero)
+    length = jnp.where(sigma > 0, -jnp.log1p(-u_flight) / jnp.maximum(sigma, 1e-30), jnp.inf)
+    for one in regions(medium):
+        t0, t1 = media.box_interval(one.bounds, origin, direction)
+        crossed = (t1 > t0) & (((t0 > 0) & (t0 < length)) | (t1 < length))
+        length = jnp.where(crossed, jnp.inf, length)
+    return length
+
+
 def homogeneous_pdf(medium: Medium, spans: Spans, throughput: Float[Array, "n 3"], t: Float[Array, "n"]):
     """Spectral mean density of a collision at t, 1/length; sigma_s * transmittance there [n, 3]; and the region."""
     t_bounds, region_of = spans

@@ -121,6 +121,7 @@ class Lanes(eqx.Module):
     first_volume: Bool[Array, "n"]
     last_volume: Bool[Array, "n"]  # type of the vertex farthest from the eye
     event: UInt[Array, "n"]  # numbers the sample's events for its random numbers
+    region: Int[Array, "n"]  # medium in which the ray starts; -1 where that is not known
     sums: Sums
     shadows: tuple[Shadow, ...]
     finished: Finished
@@ -159,6 +160,7 @@ def idle(num_lanes: int, *, groups: tuple[int, ...], num_shadows: int, tracked: 
         first_volume=b(),
         last_volume=b(),
         event=u(),
+        region=i(),
         sums=tuple(f(n, 3) if g in groups else None for g in range(NUM_GROUPS)),
         shadows=tuple(Shadow(f(n, 3), x(), f(n), f(n, 3), i(), b(), b(), u()) for _ in range(num_shadows)),
         finished=Finished(i(), u(), b(), b()),

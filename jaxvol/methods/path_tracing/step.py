@@ -66,16 +66,18 @@ def step(
     else:
         through = _closed_form_transmittance(scene, settings, lanes, casts)
     lanes = _resolve_shadows(lanes, casts, through)
-    pending = jnp.zeros(lanes.alive.shape, bool)
+    pending = late = jnp.zeros(lanes.alive.shape, bool)
     for shadow in lanes.shadows:
         pending = pending | shadow.active
-    complete = lanes.finished.valid & ~pending
+        # Only these keep the ended sample: sums of the next one's equi-angular vertex must not be added to it.
+        late = late | (shadow.active & shadow.of_finished)
+    complete = lanes.finished.valid & ~late
     ended = Ended(lanes.sums, eqx.tree_at(lambda f: f.valid, lanes.finished, complete))
     lanes = eqx.tree_at(
         lambda x: (x.finished.valid, x.sums),
         lanes,
         (
-            lanes.finished.valid & pending,
+            lanes.finished.valid & late,
             tuple(None if s is None else jnp.where(complete[:, None], 0.0, s) for s in lanes.sums),
         ),
         is_leaf=lambda x: x is None,
@@ -178,10 +180,15 @@ def _emission(scene, settings, lanes, casts, arrival, throughput):
     return throughput * radiance * mis[:, None]
 
 
+def flight_uniforms(seed, lanes):
+    """What decides the flights from where the lanes are, known before they are flown."""
+    return sampling.uniforms(seed, _STREAM, lanes.pixel, lanes.event * 8, lanes.sample)
+
+
 def _event(scene, proxy, sensor, settings, seed, lanes, casts, ready):
     """What happens where flights end: light is met, a vertex is connected to a light, and the path scatters or ends."""
     draw = lambda block: sampling.uniforms(seed, _STREAM, lanes.pixel, lanes.event * 8 + block, lanes.sample)  # noqa: E731
-    flight_u, light_u, scatter_u = draw(0), draw(1), draw(2)
+    flight_u, light_u, scatter_u = flight_uniforms(seed, lanes), draw(1), draw(2)
     arrival = _arrive(scene, proxy, settings, lanes, casts, ready, flight_u)
     throughput = lanes.throughput * arrival.weight
     count = lanes.num_vertices
@@ -248,6 +255,7 @@ def _event(scene, proxy, sensor, settings, seed, lanes, casts, ready):
             x.first_volume,
             x.last_volume,
             x.event,
+            x.region,
             x.starting,
             x.recast,
             x.recast_shadows,
@@ -264,6 +272,7 @@ def _event(scene, proxy, sensor, settings, seed, lanes, casts, ready):
             first_volume,
             last_volume,
             lanes.event + ready.astype(jnp.uint32),
+            pick(jnp.where(arrival.collided, arrival.region, -1), lanes.region),
             lanes.starting & ~ready,
             ready,
             recast_shadows,
@@ -341,6 +350,7 @@ def _refill(sensor, settings, seed, lanes, ended, work):
         first_volume=new(False, lanes.first_volume),
         last_volume=new(False, lanes.last_volume),
         event=new(jnp.uint32(1), lanes.event),
+        region=new(-1, lanes.region),
         sums=lanes.sums,
         shadows=shadows,
         finished=finished,
