@@ -26,11 +26,11 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points
 
 NODES = 20  # points per eye ray for single scattering
 SPP = (16, 64, 256)
-OURS = {
-    "full resolution": {},
-    "low resolution": {"upsample": 4},
+OURS = {  # options, and numbers of light paths
+    "full resolution": ({}, (1024, 4096)),
+    "full resolution, one new vertex": ({"num_chains": 1, "light_stride": 16}, (1024, 4096, 16384)),
+    "low resolution": ({"upsample": 4}, (1024, 4096, 16384)),
 }
-PATHS = (512, 4096)
 
 
 def mitsuba_scene(scene, size):
@@ -159,8 +159,8 @@ def main():
             ]
         )
         print(*rows[-1], flush=True)
-    for label, options in OURS.items():
-        for number in PATHS:
+    for label, (options, numbers) in OURS.items():
+        for number in numbers:
             plan = ims.plan(
                 scene,
                 camera,

@@ -6,6 +6,7 @@ light is the lights' light (virtual AND primary: a path light-x'-x-eye is clampe
 forgets) plus the same residual again.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.types import Hits, Medium, Scene
 
 _MEAN_WEIGHT = 2.0 / 3.0  # integral of 1 - q^2 over q in (0, 1)
+_CLOSE = 3.0  # clamp distances from a light within which directions are drawn towards it
 _INFINITE = 1e28  # squared distance of a light's sampled position from which it counts as infinitely far
 
 
@@ -85,6 +87,34 @@ def propose(scene: Scene, points: Points, u1: Float[Array, "n"], u2: Float[Array
         scale = ray_casting.scene_scale(scene.mesh)
         origin = jnp.where(on, ray_casting.offset_origin(points.position, points.normal, direction, scale=scale), origin)
     return Proposal(origin, direction, gain)
+
+
+def propose_near_light(
+    scene: Scene, points: Points, proposal: Proposal, target: Float[Array, "n 3"], u: tuple[Float[Array, "n"], ...]
+) -> Proposal:
+    """The same proposals, half of them turned towards the light at `target` where a point in the medium is close to it.
+
+    Light along a ray that passes the light at an angle theta from the point is about 1/sin(theta): directions of pdf
+    1/(2 pi^2 sin(theta)) take that out, mixed with those of the phase function (one-sample MIS).
+    """
+    delta = target - points.position
+    r2 = jnp.maximum(sampling.dot(delta, delta), 1e-20)
+    close = r2 < (_CLOSE * _CLOSE) * points.clamp * points.clamp
+    if points.on_surface is not None:
+        close = close & ~points.on_surface
+    axis = jnp.where(close[:, None], delta, jnp.float32([0.0, 0.0, 1.0]))
+    axis = axis / jnp.sqrt(jnp.where(close, r2, 1.0))[:, None]
+    theta, phi = math.pi * u[0], (2.0 * math.pi) * u[1]
+    ring = jnp.sin(theta)
+    local = jnp.stack([ring * jnp.cos(phi), ring * jnp.sin(phi), jnp.cos(theta)], axis=-1)
+    turned = sampling.to_world(local, axis)
+    direction = jnp.where((close & (u[2] < 0.5))[:, None], turned, proposal.direction)
+    cosine = sampling.dot(direction, axis)
+    sine = jnp.sqrt(jnp.maximum((1.0 - cosine) * (1.0 + cosine), 1e-12))
+    f = phase.evaluate(scene.medium, -sampling.dot(direction, points.outgoing))
+    mixed = 0.5 * f + 0.5 / (2.0 * math.pi * math.pi * sine)
+    gain = jnp.where(close[:, None], points.scattering * (f / mixed)[:, None], proposal.gain)
+    return Proposal(proposal.origin, direction, gain)
 
 
 class Step(NamedTuple):

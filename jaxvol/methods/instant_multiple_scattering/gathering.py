@@ -19,7 +19,8 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segment
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
 from jaxvol.types import Medium
 
-_UNROLL = 4
+_TILE = 1024  # receivers whose numbers stay in the cache
+_WIDTH = 16384  # lanes of a step: enough to hide the steps' overhead
 _INV_4PI = 0.07957747154594767
 
 
@@ -150,17 +151,54 @@ def add(total: Vector, value: Vector) -> Vector:
     return total[0] + value[0], total[1] + value[1], total[2] + value[2]
 
 
-def _sum_over(function, lights, lanes):
-    """Sum of function(light, shift) over all lights; a scan whose body holds several lights."""
-    zero = jnp.zeros(lanes, jnp.float32)
-    number = lights.position.shape[0]
+def _sum_over(function, lights, sigma_t, num_lanes, *, grey, repeats=1):
+    """Sum of strength * scale * exp(-sigma_t column) over all lights, (scale, column) = function(light, shift, repeat).
 
-    def body(total, item):
-        return add(total, function(*item)), None
+    The lanes are [k, n]: k lights at once, so that few receivers still give a step enough to do. What a step computes goes
+    into the sum one step later, through the scan's state: XLA would else compute it again in each channel's loop.
+    """
+    number = lights.position.shape[0] * repeats
+    k = max(1, min(_WIDTH // max(num_lanes, 1), number))
+    steps = -(-number // k)
 
-    items = (rows(lights), golden(jnp.arange(number)))
-    total, _ = lax.scan(body, (zero, zero, zero), items, unroll=_UNROLL)
-    return jnp.stack(total, axis=-1)
+    def rows_of(x):
+        return jnp.pad(jnp.repeat(x, repeats, axis=0), (0, steps * k - number)).reshape(steps, k, 1)
+
+    def collect(total, late):
+        strength, scale, column = late
+        if grey:
+            return tuple(t + s * scale for t, s in zip(total, strength, strict=True))
+        return tuple(t + s * scale * jnp.exp(-x * column) for t, s, x in zip(total, strength, sigma_t, strict=True))
+
+    def body(state, item):
+        total, late = state
+        light, shift, repeat = item
+        scale, column = function(light, shift, repeat)
+        if grey:
+            scale, column = scale * jnp.exp(-sigma_t[0] * column), column[:1, :1]
+        return (collect(total, late), (light.strength, scale, column)), None
+
+    zero = jnp.zeros((k, num_lanes), jnp.float32)
+    dark = jnp.zeros((k, 1), jnp.float32)
+    index = jnp.arange(lights.position.shape[0])
+    which = jnp.tile(jnp.arange(repeats, dtype=jnp.float32), index.shape[0]).reshape(-1)
+    items = (
+        *jax.tree.map(rows_of, (rows(lights), golden(index))),
+        jnp.pad(which, (0, steps * k - number)).reshape(steps, k, 1),
+    )
+    start = ((zero, zero, zero), ((dark, dark, dark), zero, zero[:1, :1] if grey else zero))
+    (total, late), _ = lax.scan(body, start, items)
+    return jnp.stack([jnp.sum(part, axis=0) for part in collect(total, late)], axis=-1)
+
+
+def _in_tiles(function, *arrays):
+    """function(*arrays) over tiles of the first axis that fit the cache; scalars and None go along as they are."""
+    n = arrays[0].shape[0]
+    tiles = max(1, n // _TILE)
+    if tiles == 1 or n % tiles:
+        return function(*arrays)
+    parts = jax.tree.map(lambda x: x.reshape(tiles, n // tiles, *x.shape[1:]), arrays)
+    return lax.map(lambda part: function(*part), parts).reshape(n, 3)
 
 
 @partial(jax.jit, static_argnames=("grey", "isotropic", "stratified", "num_evaluations"))
@@ -180,41 +218,42 @@ def gather_segments(
     sum_i f_p(x) tau(x0, x) tau(x, v_i) min(1/r^2, b) / pdf sigma_s(x) L_i sigma_s f_p(v_i), x = x_i(u). Unbiased for the
     clamped kernel; `num_evaluations` stratified points per pair.
     """
-    origin, direction = pairs.components(segments.origin), pairs.components(segments.direction)
     sigma_t = pairs.components(media.sigma_t(medium))
 
-    def evaluate(light, shift):
-        total = None
-        for k in range(num_evaluations):
-            v = (shifted(u, shift) + k) * (1.0 / num_evaluations)
-            point = choose_point(origin, direction, segments, light.position, v, stratified=stratified)
-            f = phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
-            sent, factor = leaving(light, point.towards, medium, isotropic=isotropic)
-            scale = point.weight * (factor * f * (1.0 / num_evaluations))
-            column = point.distance + (point.t - segments.t0)
-            value = extinguish(sent, scale, sigma_t, column, grey=grey)
-            total = value if total is None else add(total, value)
-        return total
+    def tile(origin, direction, t0, t1, u):
+        part = Segments(origin, direction, t0, t1, segments.clamp)
+        origin, direction = pairs.components(origin), pairs.components(direction)
 
-    collected = _sum_over(evaluate, lights, u.shape) * medium.sigma_s
+        def evaluate(light, shift, repeat):
+            v = (shifted(u, shift) + repeat) * (1.0 / num_evaluations)
+            point = choose_point(origin, direction, part, light.position, v, stratified=stratified)
+            f = phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
+            sent = phase_value(medium, pairs.dot(light.direction, point.towards), isotropic=isotropic)
+            return point.weight * (sent * f * (1.0 / num_evaluations)), point.distance + (point.t - t0)
+
+        return _sum_over(evaluate, lights, sigma_t, u.shape[0], grey=grey, repeats=num_evaluations)
+
+    collected = _in_tiles(tile, segments.origin, segments.direction, segments.t0, segments.t1, u) * medium.sigma_s
     return jnp.where((segments.t1 > segments.t0)[:, None], collected, 0.0)
 
 
 @partial(jax.jit, static_argnames=("grey", "isotropic"))
 def gather_points(points: Points, lights: VirtualLights, medium: Medium, *, grey: bool, isotropic: bool) -> Float[Array, "n 3"]:
     """Light of all lights scattered at points towards `outgoing`, homogeneous and unoccluded, clamped (min(1/r^2, b))."""
-    position = pairs.components(points.position)
     sigma_t = pairs.components(media.sigma_t(medium))
 
-    def evaluate(light, _):
-        delta = tuple(x - v for x, v in zip(position, light.position, strict=True))
-        r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
-        inverse = lax.rsqrt(r2)
-        towards = tuple(d * inverse for d in delta)
-        sent, factor = leaving(light, towards, medium, isotropic=isotropic)
-        received = scattered(points, towards, medium, isotropic=isotropic)
-        scale = pairs.inverse_square(r2, points.clamp) * factor
-        value = tuple(a * b for a, b in zip(sent, received, strict=True))
-        return extinguish(value, scale, sigma_t, r2 * inverse, grey=grey)
+    def tile(position, outgoing, clamp):
+        position, outgoing = pairs.components(position), pairs.components(outgoing)
 
-    return _sum_over(evaluate, lights, points.position.shape[:1])
+        def evaluate(light, _, __):
+            delta = tuple(x - v for x, v in zip(position, light.position, strict=True))
+            r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
+            inverse = lax.rsqrt(r2)
+            towards = tuple(d * inverse for d in delta)
+            f = phase_value(medium, pairs.dot(towards, outgoing), isotropic=isotropic)
+            sent = phase_value(medium, pairs.dot(light.direction, towards), isotropic=isotropic)
+            return pairs.inverse_square(r2, clamp) * (sent * f), r2 * inverse
+
+        return _sum_over(evaluate, lights, sigma_t, position[0].shape[0], grey=grey)
+
+    return points.scattering * _in_tiles(tile, points.position, points.outgoing, points.clamp)

@@ -25,7 +25,8 @@ _SHIFT = sampling.stream("instant_multiple_scattering.shift")
 _LATTICE = (1, 182667, 469891, 498753, 110745, 446247, 250185, 118627, 245333, 283199, 408519)
 _LATTICE_BOUNCES = 2
 _MAX_EVENTS = 100_000  # tentative collisions of one flight
-_CHUNK = 8  # bounces or tentative collisions between two compactions
+_CHUNKS = (1, 1, 2, 4)  # bounces or tentative collisions between two compactions: most paths end early
+_CHUNK = 8  # and after those
 
 
 class Walkers(eqx.Module):
@@ -305,13 +306,16 @@ def trace(
     walkers = eqx.tree_at(lambda w: w.alive, walkers, jnp.asarray(alive))
     tracked = scene.mesh is None and scene.medium is not None and scene.medium.density is not None
     state = (walkers, _tracking(walkers, jnp.zeros(alive.shape, jnp.float32))) if tracked else (walkers,)
-    found, num_truncated = [], 0
+    if scene.mesh is None:
+        alive = alive & np.asarray(_meets_medium(scene, walkers))
+    found, num_truncated, chunks = [], 0, iter(_CHUNKS)
     while np.any(alive):
+        num_steps = next(chunks, _CHUNK)
         state = _compact(state, alive)
         if tracked:
-            state, vertices = _track(scene, state, seed, num_steps=_CHUNK, max_depth=max_depth)
+            state, vertices = _track(scene, state, seed, num_steps=num_steps, max_depth=max_depth)
         elif scene.mesh is None:
-            walkers, vertices = _walk(scene, state[0], seed, num_steps=_CHUNK)
+            walkers, vertices = _walk(scene, state[0], seed, num_steps=num_steps)
             state = (walkers,)
         else:
             t, face = ray_casting.intersect(caster, state[0].origin, state[0].direction, np.inf)
@@ -329,15 +333,24 @@ def trace(
     return vertices, {"num_truncated": num_truncated}
 
 
+@jax.jit
+def _meets_medium(scene, walkers):
+    """Whether the first flight crosses the medium: where nothing else is, the others need no lane."""
+    if scene.medium is None:
+        return jnp.zeros(walkers.alive.shape, bool)
+    t0, t1 = media.box_interval(scene.medium.bounds, walkers.origin, walkers.direction)
+    return t1 > t0
+
+
 def _rows(vertices, chosen):
     return jax.tree.map(lambda x: np.asarray(x)[chosen], vertices)
 
 
 def padded(values):
-    """`values` with zeros up to a power of four times 64: few sizes, few compilations."""
+    """`values` with zeros up to a power of two times 64: few sizes, few compilations."""
     size = 64
     while size < len(values):
-        size *= 4
+        size *= 2
     return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
 
 

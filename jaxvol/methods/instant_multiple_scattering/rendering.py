@@ -2,10 +2,12 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, UInt
 
 from jaxvol import camera as pinhole
@@ -194,16 +196,25 @@ def _with_mean_source(context, camera, guides):
     """The factor that puts transmittance back, averaged over the pixel when pixels are jittered and nothing occludes."""
     if not context.plan.jitter or context.scene.mesh is not None:
         return guides
-    strata = _STRATA if context.scene.medium.density is None else _STRATA // 2
-    index = jnp.arange(guides.end.shape[0], dtype=jnp.uint32)
+    steps = max(context.plan.eye_steps // 2, 1)
+    source = _mean_source(context.scene, camera, jnp.arange(guides.end.shape[0], dtype=jnp.uint32), num_steps=steps)
+    return dataclasses.replace(guides, source=source)
+
+
+@partial(jax.jit, static_argnames="num_steps")
+def _mean_source(scene, camera, index, *, num_steps):
+    """1 - exp(-tau), averaged over strata of the pixels."""
+    strata = _STRATA if scene.medium.density is None else _STRATA // 2
     corner = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
-    total = jnp.zeros_like(guides.source)
-    for k in range(strata * strata):
-        inside = (jnp.asarray([k % strata, k // strata]) + 0.5) / strata
-        rays = cast(context, camera, corner + inside, index)
-        steps = max(context.plan.eye_steps // 2, 1)
-        total = total + upsampling.guides(context.scene, *rays[:4], num_steps=steps).source
-    return dataclasses.replace(guides, source=total / (strata * strata))
+    t = jnp.full(index.shape, jnp.inf, jnp.float32)
+    face = jnp.full(index.shape, -1, jnp.int32)
+
+    def body(k, total):
+        inside = (jnp.stack([k % strata, k // strata]).astype(jnp.float32) + 0.5) / strata
+        rays = pinhole.generate_rays(camera, corner + inside)
+        return total + upsampling.guides(scene, rays.origin, rays.direction, t, face, num_steps=num_steps).source
+
+    return lax.fori_loop(0, strata * strata, body, jnp.zeros((*index.shape, 3), jnp.float32)) / (strata * strata)
 
 
 def _without_jitter(context):

@@ -219,7 +219,7 @@ def compensate(
     sums = zero_sums(index.shape[0])
     for level in range(plan.num_levels):
         u = _chain_uniforms(context.seed, index, jnp.int32(chain * plan.num_levels + level))
-        proposal = _propose(scene, points, u)
+        proposal = _propose(scene, points, u, lit=lit)
         s, face = _surface_within(context, points, proposal)
         arguments = (scene, context.mip, points, proposal, throughput, s, face, u)
         if lit:
@@ -264,9 +264,13 @@ def _chain_uniforms(seed, index, dimension):
     return sum((sampling.uniforms(seed, _CHAIN, index, 4 * dimension + i) for i in range(3)), ())
 
 
-@jax.jit
-def _propose(scene, points, u):
-    return compensation.propose(scene, points, u[0], u[1], u[2])
+@partial(jax.jit, static_argnames="lit")
+def _propose(scene, points, u, *, lit):
+    proposal = compensation.propose(scene, points, u[0], u[1], u[2])
+    if not lit or scene.medium is None:
+        return proposal
+    target = primary.sample_light(scene, points.position, u[6], u[7], u[8]).position
+    return compensation.propose_near_light(scene, points, proposal, target, (u[0], u[1], u[10]))
 
 
 @partial(jax.jit, static_argnames="plan")
