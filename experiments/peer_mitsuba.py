@@ -87,17 +87,17 @@ def clocks():
     return time.process_time(), time.perf_counter()
 
 
-def render_ours(scene, camera, case):
-    """Our batches."""
+def render_ours(scene, camera, case, sums=SUMS):
+    """Our batches of the chosen sums."""
     plan = path_tracing.plan(scene, camera, num_lanes=case["num_lanes"])
     begin = time.perf_counter()
     path_tracing.render(scene, camera, plan, seed=case["seed"] + 10_000, samples=1)
     first = time.perf_counter() - begin
-    pictures, variances = {name: [] for name in SUMS}, []
+    pictures, variances = {name: [] for name in sums}, []
     cpu, wall = clocks()
     for batch in range(case["batches"]):
         estimate = path_tracing.render(scene, camera, plan, seed=case["seed"] + batch, samples=case["samples"])
-        for name, (layers, _) in SUMS.items():
+        for name, (layers, _) in sums.items():
             pictures[name].append(np.asarray(select(estimate.mean, layers), np.float64))
         variances.append(np.asarray(select(estimate.variance, NAMES), np.float64))
     cpu, wall = (after - before for after, before in zip(clocks(), (cpu, wall), strict=True))
@@ -111,8 +111,8 @@ def channel_of(medium, channel):
     return replace(medium, sigma_s=grey(medium.sigma_s), sigma_a=grey(medium.sigma_a), inclusions=inclusions)
 
 
-def render_peer(scene, camera, case, folder):
-    """Mitsuba's batches; `per_channel`: each channel from a grey picture of its own."""
+def render_peer(scene, camera, case, folder, sums=SUMS):
+    """Mitsuba's batches of the chosen sums; `per_channel`: each channel from a grey picture of its own."""
     import mitsuba
 
     options = {"integrator": case["integrator"], "scale": case["scale"]}
@@ -124,7 +124,7 @@ def render_peer(scene, camera, case, folder):
         described = mitsuba_export.to_mitsuba_dict(one, camera, Path(folder) / str(index), **options)
         loaded.append(mitsuba.load_dict(described))
     pictures, first = {}, 0.0
-    for name, (_, max_depth) in SUMS.items():
+    for name, (_, max_depth) in sums.items():
         integrator = mitsuba.load_dict({"type": case["integrator"], "max_depth": max_depth})
 
         def draw(seed, samples, how=integrator):
