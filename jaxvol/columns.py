@@ -155,8 +155,10 @@ def _apply(equation, values, num_rows):
         found = _apply_split(equation, name, values, num_rows)
         if found is not None:
             return found
+    if name == "stack" and _is_split(equation.outvars[0].aval.shape, num_rows) and equation.params["axis"] == 1:
+        return [Columns(tuple(values))]
     out = _bind(equation, [_join(v) for v in values])
-    return out if equation.primitive.multiple_results else [out]
+    return [_split(x, num_rows) for x in (out if equation.primitive.multiple_results else [out])]
 
 
 def _closed(jaxpr):

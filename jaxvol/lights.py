@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxvol.sampling import dot, normalize, sample_cdf, sample_triangle
+from jaxvol.sampling import (
+    dot,
+    normalize,
+    sample_cdf,
+    sample_triangle,
+    sample_uniform_sphere,
+    sample_uniform_sphere_pdf,
+)
 from jaxvol.types import AreaLights, EnvironmentLight, Mesh, Scene, SpotLights
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
@@ -139,6 +146,8 @@ def sample_environment(
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
     """A direction towards the sky and its pdf, 1/sr: a cell of the map, uniform in solid angle inside it."""
     h, w, _ = environment.radiance.shape
+    if h == 1 and w == 1:
+        return sample_uniform_sphere(u1, u2), jnp.full(u1.shape, sample_uniform_sphere_pdf(), jnp.float32)
     row = sample_cdf(u1, environment.row_cdf)
     previous = jnp.where(row > 0, environment.row_cdf[row - 1], 0.0)
     fraction = jnp.clip((u1 - previous) / jnp.maximum(environment.row_cdf[row] - previous, 1e-30), 0.0, 1.0)
@@ -175,6 +184,8 @@ def _cell_solid_angle(h, w, row):
 def sample_environment_pdf(environment: EnvironmentLight, direction: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     """The density of `sample_environment`, 1/sr."""
     h, w, _ = environment.radiance.shape
+    if h == 1 and w == 1:
+        return jnp.full(direction.shape[:-1], sample_uniform_sphere_pdf(), jnp.float32)
     row, column = _map_coordinates(environment, direction)
     row = jnp.clip(row.astype(jnp.int32), 0, h - 1)
     column = jnp.clip(column.astype(jnp.int32), 0, w - 1)

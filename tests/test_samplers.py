@@ -255,3 +255,16 @@ def test_spot_intensity_is_linear_in_the_angle():
     travel = jnp.stack([jnp.sin(angle), 0 * angle, jnp.cos(angle)], axis=1)
     got = lights.spot_falloff(spots, jnp.zeros(8, jnp.int32), travel)
     assert np.allclose(got, [1, 1, 1, 0.75, 0.5, 0.25, 0, 0], atol=1e-5)
+
+
+def test_the_fifth_uniform_is_uniform_and_independent_of_the_four():
+    num = 1 << 16
+    index = jnp.arange(num, dtype=jnp.uint32)
+    draws = np.asarray(sampling.five_uniforms(jnp.uint32(5), sampling.stream("test"), index, jnp.uint32(3)))
+    np.testing.assert_array_equal(draws[:4], sampling.uniforms(jnp.uint32(5), sampling.stream("test"), index, jnp.uint32(3)))
+    assert 0 < draws[4].min() and draws[4].max() < 1
+    for other in draws[:4]:
+        counts = np.histogram2d(draws[4], other, bins=16, range=[[0, 1], [0, 1]])[0]
+        chi2 = np.sum((counts - num / 256) ** 2) / (num / 256)
+        assert abs(chi2 - 255) < 5 * np.sqrt(2 * 255)
+    assert abs(np.corrcoef(draws[4][:-1], draws[4][1:])[0, 1]) < 5 / np.sqrt(num)

@@ -110,8 +110,7 @@ def track(scene, settings, seed, lanes, casts):
 
     def body(_, state):
         t, span, ratio, region, collided, done, counter = state
-        u1, u2, u3, u4 = sampling.uniforms(seed, _STREAM, pixel, counter, sample)
-        v = sampling.uniforms(seed, _STREAM, pixel, counter + jnp.uint32(1), sample)[0]
+        u1, u2, u3, u4, v = sampling.five_uniforms(seed, _STREAM, pixel, counter, sample)
         moved, next_span, found_region, share = flights.tentative(medium, spans, origin, direction, t, span, u1, (u2, u3, u4))
         hero_share = flights.pick(share, flight.hero)
         hit = on_path & (v < hero_share)
@@ -127,7 +126,7 @@ def track(scene, settings, seed, lanes, casts):
         old = (t, span, ratio, region, collided)
         kept = [jnp.where(done[:, None] if a.ndim == 2 else done, b, a) for a, b in zip(new, old, strict=True)]
         done = done | hit | lost | (next_span >= num_spans)
-        return (*kept, done, counter + jnp.uint32(2))
+        return (*kept, done, counter + jnp.uint32(1))
 
     state = (t, flight.span, flight.ratio, flight.region, flight.collided, ~busy | blocked, flight.counter)
     t, span, ratio, region, collided, done, counter = lax.fori_loop(0, settings.tracking_steps, body, state)
