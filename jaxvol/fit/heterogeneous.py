@@ -70,8 +70,10 @@ def truth(medium, distance: float, *, order: int = 11, num_nodes: int = 200) -> 
     """L_l of light scattered once (albedo 1, isotropic, point source of intensity 1) in a medium around the axis. `[order]`.
 
     L_l = 2 K_l / d int int P_l sigma(p) e^{-tau(receiver, p) - tau(p, source)} da dw. A jump of sigma across the nodes costs
-    accuracy: about 1e-3 at 200 nodes.
+    accuracy: layers 1e-3 at 200 nodes; spheres are integrated chord by chord.
     """
+    if isinstance(medium, Sphere):
+        return _truth_in_sphere(medium, distance, order, num_nodes)
     nodes = airlight.half_angle_nodes(num_nodes)
     t = distance * nodes.receiver_distance
     points = np.stack([t * nodes.sin_receiver, 0 * t, t * nodes.cos_receiver], axis=-1)
@@ -80,6 +82,30 @@ def truth(medium, distance: float, *, order: int = 11, num_nodes: int = 200) -> 
     depth = medium.optical_thickness(np.zeros(3), points) + medium.optical_thickness(points, np.array([0.0, 0.0, distance]))
     value = nodes.weight[keep] * medium.sigma(points) * np.exp(-depth)
     return 2 / distance * harmonics.zonal_norm(order) * (value @ legvander(nodes.cos_receiver[keep], order - 1))
+
+
+def _truth_in_sphere(sphere: Sphere, distance: float, order: int, num_nodes: int) -> np.ndarray:
+    """The same over the viewing angle theta and the angle y at the source (t = d cos theta + h tan y, h = d sin theta).
+
+    L_l = sigma / (2 d) K_l int P_l int e^{-tau} dy dtheta, y over the part of the ray inside.
+    """
+    outside = sphere.centre >= sphere.radius
+    widest = np.arcsin(sphere.radius / sphere.centre) if outside else np.pi
+    if sphere.centre <= -sphere.radius:
+        raise ValueError("a sphere behind the receiver is not supported")
+    x, _, weight = airlight.double_exponential(num_nodes, limit=2.6)
+    theta = (widest * x)[:, None]
+    height, along = distance * np.sin(theta), sphere.centre * np.cos(theta)
+    root = np.sqrt(np.maximum(sphere.radius**2 - (sphere.centre * np.sin(theta)) ** 2, 0))
+    ends = [np.arctan2(np.maximum(along + side * root, 0) - distance * np.cos(theta), height) for side in (-1, 1)]
+    y = ends[0] + (ends[1] - ends[0]) * x
+    t = np.maximum(distance * np.cos(theta) + height * np.tan(y), 0)
+    points = np.stack([t * np.sin(theta), 0 * t, t * np.cos(theta)], axis=-1)
+    source = np.array([0.0, 0.0, distance])
+    depth = sphere.optical_thickness(np.zeros(3), points) + sphere.optical_thickness(points, source)
+    seen = (ends[1] - ends[0])[:, 0] * (np.exp(-depth) @ weight)
+    polynomials = legvander(np.cos(theta[:, 0]), order - 1)
+    return sphere.sigma_inside / (2 * distance) * widest * harmonics.zonal_norm(order) * ((weight * seen) @ polynomials)
 
 
 def effective(medium, distance: float, *, order: int = 11) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from jaxvol import harmonics
+from jaxvol import airlight, harmonics
 from jaxvol.fit import green, monte_carlo, phase_moments, validation, zonal_tables
 from tests.problems_tables import AREA, DIRECTIONAL, POINT, POINT_G
 
@@ -30,12 +30,21 @@ def test_directional_lists(tau):
 
 
 def test_area_list():
+    """To the printed digits but for L_10, whose last digit is wrong: .0410634 printed, .0410635 by both quadratures."""
     found = zonal_tables.unscale_point(zonal_tables.area_table(1.0, np.pi / 3), 1.0)[0, 0]
-    # the list left the kinks unresolved (its L_10 is 3e-6 low); the exact values: test_area_against_independent_quadrature
-    np.testing.assert_allclose(found[:6], AREA, atol=1.5e-7)
-    coefficients = zonal_tables.area_table(1.0, np.pi / 3, order=11)[0, 0].astype(np.float32)
-    irradiance = harmonics.half_irradiance(coefficients, np.array([0, 0, 1], np.float32))
-    assert abs(float(irradiance) * np.exp(-1) - 0.0991855) < 2e-4  # float32 and order 11; the list's value is exact
+    independent = validation.area_entry(1.0, np.pi / 3, moments=np.ones(1), order=3) * np.exp(-1)
+    np.testing.assert_allclose(found[:6], independent, atol=2e-9)
+    right = [0, 2, 3, 4, 5]
+    np.testing.assert_allclose(found[right], np.array(AREA)[right], atol=5.1e-8)
+    assert abs(found[1] - 0.04106353) < 6e-9
+    # the list's irradiance .0991855 is that of order 11 (its own last digit uses its L_10); the exact one is smaller
+    zonal = [i for i, (_, m) in enumerate(harmonics.half_index(11)) if m == 0]
+    coefficients = zonal_tables.unscale_point(zonal_tables.area_table(1.0, np.pi / 3, order=11), 1.0)[0, 0, zonal]
+    assert abs(harmonics.clamped_cosine(11) @ coefficients - 0.0991855) < 1.1e-7
+    nodes = airlight.area_nodes(150, np.pi / 3)
+    emission = airlight.area_emission(nodes, np.pi / 3, 1)[:, 0]
+    exact = np.sum(2 * nodes.weight * emission * np.maximum(nodes.cos_receiver, 0) * np.exp(-1 - nodes.excess))
+    assert abs(exact - 0.0990614) < 3e-7
 
 
 def test_point_within_1e8_over_all_tau():
