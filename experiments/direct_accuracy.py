@@ -37,6 +37,11 @@ def load(name, width):
     return file.scene, file.camera
 
 
+def layers(values):
+    """The two layers as one array [2, H, W, 3]."""
+    return np.stack([np.asarray(getattr(values, name), np.float64) for name in LAYERS])
+
+
 def reference(problem, camera, path, *, seconds):
     """Means and variances [2, H, W, 3] of the two layers, after `seconds` more of paths than the file held."""
     old = dict(np.load(path)) if path.exists() else None
@@ -68,7 +73,7 @@ def rows_of(name, arguments):
     for seed in (1, 0):  # the second run is warm
         cpu = time.process_time()
         found = direct.render(problem, camera, plan, seed=seed)
-        pictures.append(np.stack([np.asarray(getattr(found.mean, n), np.float64) for n in LAYERS]))
+        pictures.append(layers(found.mean))
         cpu = time.process_time() - cpu
     other, mine = pictures
     rows = []

@@ -3,12 +3,17 @@
 Stages: `first_hit` (surfaces, emission, transmittance to the eye), `surface` (L S E), `cells` and `single_scattering`
 (L V E), each light in turn through `connections` (shadows, transmittance towards the light).
 
+Light from the environment through a grid comes from a field swept once per picture (`sky_field`) where eye and surfaces
+are outside the medium's box, its voxels are optically thin and its phase function is not too peaked; elsewhere every
+node marches (`num_sky_directions=0` asks for that). Directions are drawn by tables made for the picture (`sky_sampling`).
+
 Point, spot and directional lights: positions inside the pixel and nodes on the eye ray are midpoint rules, the same for
 every seed; the error is that of the rules (edges, density changes within a cell). Emissive faces and the environment:
 low-discrepancy sets, shifted per pixel by a hash of the seed; unbiased but for transmittance, which is marched with one
-step per voxel from the eye and per two voxels towards lights (second order). Equi-angular steps: Kulla and Fajardo 2012,
-"Importance Sampling Techniques for Path Tracing in Participating Media"; transmittance-warped steps: the same integral
-inverted numerically.
+step per voxel or finer from the eye and per two voxels towards lights (second order; finer in small grids). The field
+is the same for every seed; its error is that of a few hundred directions and of the voxel. Equi-angular steps: Kulla
+and Fajardo 2012, "Importance Sampling Techniques for Path Tracing in Participating Media"; transmittance-warped steps:
+the same integral inverted numerically.
 
 Cannot: refraction (refused), more than one scattering event.
 """

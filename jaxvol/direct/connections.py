@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxvol import extinction, materials, ray_casting, segments
+from jaxvol import extinction, materials, media, ray_casting, segments
 from jaxvol.direct.emitters import Emitters, emitters
 from jaxvol.direct.light_columns import LightColumns, light_columns
 from jaxvol.direct.light_columns import optical_thickness as from_columns
@@ -177,15 +177,25 @@ def resolve(context: Context, run: LightRun, connections: Connections) -> Float[
         return _attenuate_by_columns(value, lit, run.columns, context.marching.regions[0], rays[0])
     if segments.is_box(context.scene.medium) and context.scene.medium.density is None:
         return _attenuate_and_sum(value, lit, _depth(context, *rays))
-    # Marching is dear: only connections that still carry light, padded to few different sizes.
+    # Marching is dear: only connections that still carry light and meet the medium, padded to few different sizes.
     lit = np.asarray(_carries_light(value)) if lit is None else lit
-    chosen = np.flatnonzero(lit)
-    result = np.zeros((lit.size, 3), np.float32)
+    chosen = np.flatnonzero(lit.reshape(-1) & np.asarray(_meets_medium(context.marching, *rays)))
+    result = np.where(lit[..., None], np.asarray(value), np.float32(0.0)).reshape(-1, 3)
     if chosen.size:
         padded = np.concatenate([chosen, np.full(bucket(chosen.size) - chosen.size, chosen[0])])
         depth = _depth(context, *(np.asarray(x)[padded] for x in rays))
-        result[chosen] = np.exp(-np.asarray(depth)[: chosen.size]) * np.asarray(value).reshape(-1, 3)[chosen]
+        result[chosen] *= np.exp(-np.asarray(depth)[: chosen.size])
     return jnp.asarray(result.reshape(value.shape).sum(axis=0))
+
+
+@jax.jit
+def _meets_medium(marching, origin, direction, distance):
+    """Whether a ray meets the box of any region before it ends."""
+    met = jnp.zeros(distance.shape, bool)
+    for medium in marching.regions:
+        t0, t1 = media.box_interval(medium.bounds, origin, direction)
+        met = met | (t0 < jnp.minimum(t1, distance))
+    return met
 
 
 def _depth(context, origin, direction, distance):

@@ -108,7 +108,8 @@ def plan(
     if num_environment_samples is None:
         num_environment_samples = 40 if is_map else 12
     if num_environment_steps is None:
-        num_environment_steps = 64 if is_map and not across else 32
+        cheap = scene.medium is None or (not across and segments.is_box(scene.medium))
+        num_environment_steps = 64 if is_map and cheap else 32
     if num_bsdf_samples is None:
         num_bsdf_samples = _default_bsdf_samples(scene)
     if num_phase_steps is None:
@@ -128,7 +129,7 @@ def plan(
         volume=volume,
         samples_per_pixel=samples_per_pixel,
         volume_samples_per_pixel=volume_samples_per_pixel,
-        num_cells=num_cells or (min(max(across, 16), _MOST_STEPS) if across else 16),
+        num_cells=num_cells or (min(max(across + across // 2, min(4 * across, 64)), _MOST_STEPS) if across else 16),
         num_steps=num_steps or (16 if across else 8),
         num_area_samples=num_area_samples,
         num_area_points=num_area_points,
@@ -140,7 +141,8 @@ def plan(
         num_phase_steps=num_phase_steps,
         num_sky_directions=num_sky_directions,
         num_field_steps=num_field_steps,
-        num_light_steps=num_light_steps or min(max(-(-across // 2), 1), _MOST_STEPS),
+        # Small grids are marched finely: nothing says that their voxels are thin.
+        num_light_steps=num_light_steps or min(max(-(-across // 2), min(4 * across, 48), 1), _MOST_STEPS),
         rays_per_chunk=rays_per_chunk,
         skipped=skipped,
     )

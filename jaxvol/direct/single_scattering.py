@@ -91,11 +91,10 @@ def _connections(context: Context, run: LightRun, cells, origin, direction, pixe
     """The sets of connections that one light wants, one after the other."""
     plan = context.plan
     data = (context.marching, run.scene, cells, origin, direction, pixel, sample, seed)
-    guide = {"guide": run.guide}
     if run.kind in ("point", "spot"):
         yield _to_point(*data, 0, kind=run.kind, num_steps=plan.num_steps, num_points=1, num_samples=num_samples)
     elif run.kind == "directional":
-        yield _to_sky(*data, num_steps=plan.num_steps, num_samples=num_samples, num_phase=0, directional=True)
+        yield _to_sky(*data, None, num_steps=plan.num_steps, num_samples=num_samples, num_phase=0, directional=True)
     elif run.emitters is not None:
         yield _to_emitters(*data, run.emitters, num_steps=plan.num_emitter_steps, num_samples=num_samples)
     elif run.kind == "area":
@@ -105,9 +104,9 @@ def _connections(context: Context, run: LightRun, cells, origin, direction, pixe
     else:
         sizes = {"num_samples": num_samples, "num_phase": plan.num_phase_steps}
         if plan.num_environment_steps:
-            yield _to_sky(*data, num_steps=plan.num_environment_steps, directional=False, **guide, **sizes)
+            yield _to_sky(*data, run.guide, num_steps=plan.num_environment_steps, directional=False, **sizes)
         if plan.num_phase_steps:
-            yield _along_phase(*data, num_steps=plan.num_environment_steps, **guide, **sizes)
+            yield _along_phase(*data, run.guide, num_steps=plan.num_environment_steps, **sizes)
 
 
 def _phase(marching, region, cos_theta):
@@ -251,7 +250,7 @@ def _from_field(marching, field, cells, origin, direction, sample, *, num_steps,
 
 @partial(jax.jit, static_argnames=("num_steps", "num_samples", "num_phase"))
 def _along_phase(
-    marching, scene, cells, origin, direction, pixel, sample, seed, *, guide, num_steps, num_samples, num_phase
+    marching, scene, cells, origin, direction, pixel, sample, seed, guide, *, num_steps, num_samples, num_phase
 ) -> Connections:
     """Towards the environment in directions drawn from the phase function (which is reciprocal)."""
     nodes, u1, u2 = _sky_nodes(marching, cells, pixel, sample, seed, num_phase, num_samples, _PHASE_SET)
