@@ -78,11 +78,16 @@ APPROXIMATIONS = {
         "clamped only": {"num_levels": 0},
         "2 steps": {"num_levels": 2},
         "local transmittance": {"transmittance": "local"},
+        "local transmittance where the gradient is small": {"transmittance": "detected"},
+        "maps of columns, 32^2": {"columns": "maps"},
+        "marching a coarse copy": {"columns": "mip"},
         "no direct light at the vertex (the paper)": {"direct_at_vertex": False},
     },
     "room": {
         "clamped only": {"num_levels": 0},
         "no visibility of new vertices": {"visibility": "none"},
+        "depth maps for new vertices, 32^2": {"visibility": "maps"},
+        "depth maps for shadows too, 32^2": {"visibility": "maps", "shadows": "maps"},
         "no direct light at the vertex (the paper)": {"direct_at_vertex": False},
     },
 }

@@ -135,6 +135,19 @@ def mesh_of(boxes) -> Mesh:
 
 
 def fogged_room() -> Scene:
+    """A room that is open to the eye, a block in it, full of fog of g = 0.3, the light inside."""
+    walls = [
+        box((-1.1, -1.1, -1.1), (1.1, -1, 1), (0.7, 0.7, 0.7)),
+        box((-1.1, 1, -1.1), (1.1, 1.1, 1), (0.7, 0.7, 0.7)),
+        box((-1.1, -1, -1.1), (-1, 1, 1), (0.6, 0.2, 0.2)),
+        box((1, -1, -1.1), (1.1, 1, 1), (0.2, 0.6, 0.2)),
+        box((-1, -1, -1.1), (1, 1, -1), (0.6, 0.6, 0.6)),
+        box((-0.6, -1, -0.6), (0.0, -0.2, 0.0), (0.4, 0.4, 0.7)),
+    ]
+    return _lit(_medium(0.7, 6 / 7, 0.3, half=1.02), mesh_of(walls), position=(0.3, 0.4, 0.2))
+
+
+def fogged_corner() -> Scene:
     """Floor, back wall and a block in fog of g = 0.3, the light among them."""
     mesh = mesh_of(
         [
@@ -156,4 +169,5 @@ SCENES = {
     "cube_g": lambda: cube(0.7),
     "plume": plume,
     "room": fogged_room,
+    "corner": fogged_corner,
 }

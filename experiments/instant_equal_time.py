@@ -28,8 +28,9 @@ NODES = 20  # points per eye ray for single scattering
 SPP = (16, 64, 256)
 OURS = {  # options, and numbers of light paths
     "full resolution": ({}, (1024, 4096)),
+    "full resolution, 8 for the primary light": ({"num_direct": 8}, (2048, 4096)),
     "full resolution, one new vertex": ({"num_chains": 1, "light_stride": 16}, (1024, 4096, 16384)),
-    "low resolution": ({"upsample": 4}, (1024, 4096, 16384)),
+    "low resolution": ({"upsample": 4, "num_direct": 16}, (1024, 4096, 16384)),
 }
 
 

@@ -127,7 +127,7 @@ def leak_scene():
 def fig5(size, samples):
     scene, camera = leak_scene(), square_camera(size)
     reference, _, variance = reference_of(scene, camera, samples)
-    modes = {"rays": {}, "none": {"visibility": "none"}}
+    modes = {"rays": {}, "maps": {"visibility": "maps", "shadows": "maps"}, "none": {"visibility": "none"}}
     found = {name: timed(scene, camera, num_paths=512, **options) for name, options in modes.items()}
     dark = np.zeros((size, size), bool)
     dark[size // 4 : 3 * size // 4, size // 2 + 1 : size // 2 + max(2, size // 6)] = True
@@ -138,8 +138,8 @@ def fig5(size, samples):
     header = ["visibility", "cpu_s", "bias", "bias_beside_the_wall", "reference_noise"]
     write_csv(out_folder() / "fig5.csv", header, rows)
     shown = [reference, *(found[name][0] for name in modes), 5 * np.abs(found["none"][0] - found["rays"][0])]
-    titles = ["path tracer", "rays to new vertices", "no visibility test", "5 x difference"]
-    pictures(out_folder() / "fig5.png", shown, columns=4, scale=0.7 / np.percentile(reference, 98), titles=titles)
+    titles = ["path tracer", "rays to new vertices", "depth maps of lights", "no visibility test", "5 x |none - rays|"]
+    pictures(out_folder() / "fig5.png", shown, columns=5, scale=0.7 / np.percentile(reference, 98), titles=titles)
     return rows
 
 

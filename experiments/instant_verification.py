@@ -26,10 +26,11 @@ SETTINGS = {
     "cube": {"num_paths": 16384},
     "cube_g": {"num_paths": 16384, "num_direct": 32},
     "plume": {"num_paths": 16384, "num_direct": 8, "group_size": 40},
-    "room": {"num_paths": 65536, "num_direct": 8, "group_size": 100, "light_stride": 16},
+    "room": {"num_paths": 16384, "num_direct": 8, "group_size": 100, "light_stride": 16},
+    "corner": {"num_paths": 65536, "num_direct": 8, "group_size": 100, "light_stride": 16},
 }
 SIZE = 24
-SAMPLES = {"cube": 256, "cube_g": 256, "plume": 256, "room": 256}  # of one run of the reference
+SAMPLES = {"cube": 256, "cube_g": 256, "plume": 256, "room": 64, "corner": 256}  # of one run of the reference
 LANES = 256
 
 

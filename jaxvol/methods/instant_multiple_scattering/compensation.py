@@ -20,6 +20,7 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.types import Hits, Medium, Scene
 
 _MEAN_WEIGHT = 2.0 / 3.0  # integral of 1 - q^2 over q in (0, 1)
+_EVEN = 0.1  # share by which extinction may change within the clamp distance
 _CLOSE = 3.0  # clamp distances from a light within which directions are drawn towards it
 _INFINITE = 1e28  # squared distance of a light's sampled position from which it counts as infinitely far
 
@@ -178,6 +179,7 @@ def new_vertices(
     t: Float[Array, "n"],
     factor: Float[Array, "n"],
     sigma: Float[Array, "n"],
+    even: Bool[Array, "n"],
     *,
     transmittance: str,
     num_steps: int,
@@ -185,7 +187,7 @@ def new_vertices(
     """The new vertices x' and what carries their light to the points: gain tau(x, x') max(0, 1 - t^2/d^2) / p(t).
 
     (t, factor) is the distance in the medium and its weight / pdf. `sigma` is the local mean extinction that with
-    transmittance="local" takes the place of the true one (biased).
+    transmittance="local" takes the place of the true one (biased), with "detected" only where it hardly changes.
     """
     medium = scene.medium
     factor = factor / jnp.maximum(1.0 - step.to_surface, 1e-6)
@@ -196,11 +198,13 @@ def new_vertices(
     scattering = jnp.zeros_like(throughput)
     if medium is not None:
         scattering = media.density(medium, position)[:, None] * medium.sigma_s
-        if transmittance == "local":
-            depth = (sigma * t)[:, None] * _relative(medium)
-        else:
+        local = (sigma * t)[:, None] * _relative(medium)
+        depth = local
+        if transmittance != "local":
             column = receivers.column_between(medium, proposal.origin, position, num_steps=num_steps)
             depth = column[:, None] * media.sigma_t(medium)
+        if transmittance == "detected":
+            depth = jnp.where(even[:, None], local, depth)
         throughput = throughput * jnp.exp(-depth)
     outgoing = -proposal.direction
     if points.on_surface is None:
@@ -281,14 +285,34 @@ def local_sigma(medium: Medium | None, mip: Float[Array, "x y z"] | None, positi
     return sigma * mip.reshape(-1)[flat]
 
 
-def coarse_density(density: Float[Array, "X Y Z"], *, block: int) -> np.ndarray:
-    """Mean density of blocks of voxels, smoothed over the neighbours; eager. Its cells are `block` voxels wide (at least)."""
+def is_even(
+    medium: Medium | None, mip: Float[Array, "x y z"] | None, position: Float[Array, "n 3"], clamp: Float[Array, "n"]
+) -> Bool[Array, "n"]:
+    """Whether extinction changes by less than a tenth within the clamp distance: |grad sigma_t| d < 0.1 sigma_t (4.4)."""
+    if medium is None or mip is None:
+        return jnp.ones(position.shape[:-1], bool)
+    cell = (medium.bounds[1] - medium.bounds[0]) / jnp.asarray(mip.shape, jnp.float32)
+    here = local_sigma(medium, mip, position)
+    squared = jnp.zeros_like(here)
+    for axis in range(3):
+        aside = cell[axis] * jnp.eye(3, dtype=jnp.float32)[axis]
+        slope = (local_sigma(medium, mip, position + aside) - local_sigma(medium, mip, position - aside)) / (2.0 * cell[axis])
+        squared = squared + slope * slope
+    return jnp.sqrt(squared) * clamp < _EVEN * here
+
+
+def block_means(density: Float[Array, "X Y Z"], *, block: int) -> np.ndarray:
+    """Mean density of blocks of voxels, at least `block` wide; eager."""
     grid = np.asarray(density, np.float64)
-    shape = [max(n // block, 1) for n in grid.shape]
-    for axis, count in enumerate(shape):
+    for axis, count in enumerate([max(n // block, 1) for n in grid.shape]):
         parts = np.array_split(grid, count, axis=axis)
         grid = np.stack([part.mean(axis=axis) for part in parts], axis=axis)
-    padded = np.pad(grid, 1, mode="edge")
+    return grid.astype(np.float32)
+
+
+def coarse_density(density: Float[Array, "X Y Z"], *, block: int) -> np.ndarray:
+    """Mean density of blocks of voxels, smoothed over the neighbours; eager. Its cells are `block` voxels wide (at least)."""
+    padded = np.pad(block_means(density, block=block), 1, mode="edge")
     for axis in range(3):
         n = padded.shape[axis]
         low, mid, high = (np.take(padded, range(k, n - 2 + k), axis=axis) for k in range(3))

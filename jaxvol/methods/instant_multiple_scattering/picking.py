@@ -79,13 +79,18 @@ def _pick(estimate, lights, u, num_groups, num_payload):
         members, indices, shifts, start = item
         start = gathering.shifted(u, start)
         empty = _Reservoir(zero, zero, jnp.zeros(u.shape, jnp.int32), (zero,) * num_payload, start)
+        nothing = (zero, jnp.int32(0), (zero,) * num_payload)
 
-        def member(reservoir, row):
+        def member(state, row):
+            # Offered one step later, through the scan's state: XLA would else compute the estimate again for every
+            # field of the reservoir.
+            reservoir, late = state
             light, index, shift = row
             value, payload = estimate(light, shift)
-            return _offer(reservoir, value, index, payload), None
+            return (_offer(reservoir, *late), (value, index, payload)), None
 
-        kept, _ = lax.scan(member, empty, (members, indices, shifts), unroll=2)
+        (kept, late), _ = lax.scan(member, (empty, nothing), (members, indices, shifts))
+        kept = _offer(kept, *late)
         scale = jnp.where(kept.total > 0, kept.total / jnp.maximum(kept.estimate, 1e-37), 0.0)
         return None, (kept.light, scale, *kept.payload)
 
@@ -206,8 +211,10 @@ def evaluate_segments(
     segments: Segments,
     picks: Picks,
     visible: Float[Array, "k n"] | None,
+    columns: Float[Array, "k n"] | None,
     lights: VirtualLights,
     medium: Medium,
+    marched: Medium,
     clamps: Float[Array, "k n"] | None,
     *,
     isotropic: bool,
@@ -215,13 +222,14 @@ def evaluate_segments(
 ) -> Float[Array, "n 3"]:
     """Radiance that eye rays collect from the picked lights, true transmittance and visibility (None: all visible).
 
-    `clamps` are the clamp distances at the points where they differ from the ray's own least one (None: they do not).
+    `columns` of density to the lights may be given; else they are marched through the medium `marched`. `clamps` are the
+    clamp distances at the points where they differ from the ray's own least one (None: they do not).
     """
     direction = pairs.components(segments.direction)
     sigma_t = pairs.components(media.sigma_t(medium))
 
     def body(total, item):
-        index, weight, t, seen, clamp = item
+        index, weight, t, seen, column, clamp = item
         light: Light = _chosen(lights, index)
         x = segments.origin + t[:, None] * segments.direction
         _, r2, _, towards = _between(pairs.components(x), light.position)
@@ -232,13 +240,14 @@ def evaluate_segments(
         if seen is not None:
             scale = scale * seen
         sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
-        column = receivers.column_between(medium, x, jnp.stack(light.position, -1), num_steps=num_steps)
+        if column is None:
+            column = receivers.column_between(marched, x, jnp.stack(light.position, -1), num_steps=num_steps)
         column = column + receivers.column_at(segments, t)
         value = gathering.extinguish(sent, scale * factor, sigma_t, column, grey=False)
         return gathering.add(total, value), None
 
     zero = jnp.zeros_like(segments.t0)
-    items = (picks.light, picks.weight, picks.t, visible, clamps)
+    items = (picks.light, picks.weight, picks.t, visible, columns, clamps)
     total, _ = lax.scan(body, (zero, zero, zero), items)
     return jnp.stack(total, axis=-1) * medium.sigma_s
 
@@ -248,8 +257,10 @@ def evaluate_points(
     points: Points,
     picks: Picks,
     visible: Float[Array, "k n"] | None,
+    columns: Float[Array, "k n"] | None,
     lights: VirtualLights,
     medium: Medium | None,
+    marched: Medium | None,
     *,
     isotropic: bool,
     num_steps: int,
@@ -258,7 +269,7 @@ def evaluate_points(
     position = pairs.components(points.position)
 
     def body(total, item):
-        index, weight, seen = item
+        index, weight, seen, column = item
         light: Light = _chosen(lights, index)
         _, _, _, towards = _between(position, light.position)
         scale = weight if seen is None else weight * seen
@@ -268,11 +279,12 @@ def evaluate_points(
         value = tuple(a * b for a, b in zip(sent, received, strict=True))
         if medium is None:
             return gathering.add(total, tuple(v * scale for v in value)), None
-        ends = jnp.stack(light.position, -1)
-        column = receivers.column_between(medium, points.position, ends, num_steps=num_steps)
+        if column is None:
+            ends = jnp.stack(light.position, -1)
+            column = receivers.column_between(marched, points.position, ends, num_steps=num_steps)
         value = gathering.extinguish(value, scale, pairs.components(media.sigma_t(medium)), column, grey=False)
         return gathering.add(total, value), None
 
     zero = jnp.zeros(points.position.shape[:1], jnp.float32)
-    total, _ = lax.scan(body, (zero, zero, zero), (picks.light, picks.weight, visible))
+    total, _ = lax.scan(body, (zero, zero, zero), (picks.light, picks.weight, visible, columns))
     return jnp.stack(total, axis=-1)

@@ -9,7 +9,8 @@ from jaxvol.layers import Claim
 from jaxvol.types import Camera, Scene
 
 _CLAIMED = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in ("surface", "volume", "multiple"))
-_PICKS_A_MARCH_IS_WORTH = 10  # lights a group: marching and casting cost about ten kernel evaluations
+_MAP_BYTES = 256e6
+_PICKS_A_MARCH_IS_WORTH = 20  # lights a group: marching and casting cost about ten kernel evaluations
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,10 @@ class Plan:
     distance: str
     transmittance: str
     visibility: str
+    shadows: str
+    columns: str
+    map_size: int
+    map_steps: int
     direct_at_vertex: bool
     sampling: str
     num_evaluations: int
@@ -52,8 +57,10 @@ class Plan:
 CHOICES = {
     "end": ("clamped", "unclamped", "reduced"),
     "distance": ("weight", "exponential"),
-    "transmittance": ("true", "local"),
-    "visibility": ("rays", "none"),
+    "transmittance": ("true", "local", "detected"),
+    "visibility": ("rays", "maps", "none"),
+    "shadows": ("rays", "maps"),
+    "columns": ("auto", "march", "mip", "maps"),
     "sampling": ("equiangular", "stratified"),
     "specialize": ("values", "structure"),
 }
@@ -86,6 +93,10 @@ def plan(
     distance: str = "weight",
     transmittance: str = "true",
     visibility: str = "rays",
+    shadows: str = "rays",
+    columns: str = "auto",
+    map_size: int = 32,
+    map_steps: int = 16,
     direct_at_vertex: bool = True,
     sampling: str = "equiangular",
     num_evaluations: int = 1,
@@ -109,8 +120,11 @@ def plan(
     light_stride: new vertices gather from one of `light_stride` lights, another share each time.
     end: what happens beyond the last step: "clamped" (loses about (0.7 mean_free_paths)^(num_levels + 1) of the energy,
     0.4 % by default), "unclamped" (unbiased, infinite variance), "reduced" (bound times 16).
-    distance: "weight" or the paper's "exponential"; transmittance to new vertices: "true" or "local" (biased);
-    visibility of new vertices: "rays" or "none" (biased near surfaces).
+    distance: "weight" or the paper's "exponential"; transmittance to new vertices: "true", "local" (biased), or
+    "detected": local where the gradient of sigma_t is small. visibility of new vertices: "rays", "maps" (the depth map of
+    the nearest light with a least-depth test; approximate), or "none" (biased near surfaces).
+    shadows: of lights, by "rays" or by "maps" of map_size^2 texels each (approximate). columns: density towards lights by
+    "march"ing, through a "mip" of half the resolution, by "maps" with map_steps steps; "auto" takes what costs least.
     direct_at_vertex: False leaves out the primary lights there, as the paper's text does (biased).
     sampling: "equiangular", or "stratified" with num_evaluations points per light (the paper).
     group_size: where pairs are costly, one light of so many is marched to and tested for occlusion.
@@ -125,6 +139,8 @@ def plan(
         "distance": distance,
         "transmittance": transmittance,
         "visibility": visibility,
+        "shadows": shadows,
+        "columns": columns,
         "sampling": sampling,
         "specialize": specialize,
     }
@@ -132,7 +148,7 @@ def plan(
         if value not in CHOICES[key]:
             raise ValueError(f"{key}: {value!r} is not allowed, must be one of {', '.join(CHOICES[key])}")
     least = {"num_paths": 1, "num_sets": 1, "max_depth": 1, "num_levels": 0, "num_chains": 1, "num_direct": 1}
-    least.update(num_evaluations=1, group_size=1, mip_block=1, upsample=1, tile=64)
+    least.update(map_size=4, map_steps=1, num_evaluations=1, group_size=1, mip_block=1, upsample=1, tile=64)
     for key, low in least.items():
         if locals()[key] < low:
             raise ValueError(f"{key}: {locals()[key]} is not allowed, must be >= {low}")
@@ -162,12 +178,16 @@ def plan(
         distance=distance,
         transmittance=transmittance,
         visibility=visibility,
+        shadows=shadows if scene.mesh is not None else "rays",
+        columns=_columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsample),
+        map_size=map_size,
+        map_steps=map_steps,
         direct_at_vertex=direct_at_vertex,
         sampling=sampling,
         num_evaluations=num_evaluations,
         group_size=group_size,
         eye_steps=_eye_steps(medium) if eye_steps is None else eye_steps,
-        pair_steps=16 if pair_steps is None else pair_steps,
+        pair_steps=8 if pair_steps is None else pair_steps,
         mip_block=mip_block,
         upsample=upsample,
         refine_below=refine_below,
@@ -220,6 +240,21 @@ def _eye_steps(medium):
     if medium is None or medium.density is None:
         return 0
     return int(np.clip(8 * -(-max(medium.density.shape) // 8), 32, 256))
+
+
+def _columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsample):
+    """How columns towards lights are found: maps where a light has several times more receivers than texels.
+
+    A map costs its texels, a march one in `group_size` of the receivers, both with as many lookups; reading a map costs
+    a tenth of a march (experiments/instant_transmittance.py). Maps of all lights must fit into 256 MB.
+    """
+    if not tracked:
+        return "march"
+    if columns != "auto":
+        return columns
+    receivers = 1.75 * camera.height * camera.width / (upsample * upsample * group_size)
+    fits = 4 * num_paths * map_size * map_size * 16 * 4 < _MAP_BYTES
+    return "maps" if fits and receivers > 1.5 * map_size * map_size else "march"
 
 
 def _skipped(scene, lit, scatters, reflects, values):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, UInt
 
 from jaxvol import camera as pinhole
 from jaxvol import layers, materials, media, ray_casting, sampling
-from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, stages, upsampling, virtual_lights
+from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, maps, stages, upsampling, virtual_lights
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.methods.instant_multiple_scattering.stages import Context
@@ -42,11 +42,21 @@ def make_context(
     counts: dict[str, int] = {}
     if lights is None:
         lights, counts = trace_lights(scene, caster, plan, seed=seed, sizes=sizes)
-    medium = scene.medium
+    medium = marched = scene.medium
     mip = None
     if medium is not None and medium.density is not None:
         mip = jnp.asarray(compensation.coarse_density(medium.density, block=plan.mip_block))
-    return Context(scene, caster, lights, mip, plan, seed), counts
+        if plan.columns == "mip":
+            marched = dataclasses.replace(medium, density=jnp.asarray(compensation.block_means(medium.density, block=2)))
+    context = Context(scene, caster, lights, mip, plan, seed, marched)
+    depth = "maps" in (plan.shadows, plan.visibility)
+    if virtual_lights.num_lights(lights) and (depth or plan.columns == "maps"):
+        found = maps.build(
+            scene, caster, lights, size=plan.map_size, num_steps=plan.map_steps, depth=depth, columns=plan.columns == "maps"
+        )
+        tree = maps.make_tree(found) if plan.visibility == "maps" else None
+        context = context._replace(maps=found, tree=tree)
+    return context, counts
 
 
 def gather_rays(

@@ -11,17 +11,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt
+from scipy.spatial import cKDTree
 
 from jaxvol import lights as primary
 from jaxvol import media, ray_casting, sampling
-from jaxvol.methods.instant_multiple_scattering import compensation, gathering, picking, receivers
+from jaxvol.methods.instant_multiple_scattering import compensation, gathering, maps, picking, receivers
+from jaxvol.methods.instant_multiple_scattering.maps import Maps
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import ORIGIN, LightSet, VirtualLights, blocks
-from jaxvol.types import Scene
+from jaxvol.types import Medium, Scene
 
 _EYE = sampling.stream("instant_multiple_scattering.eye")
 _CHAIN = sampling.stream("instant_multiple_scattering.chain")
+_RECURRENCE = (0.8566749, 0.7338919, 0.6287067, 0.5385973)  # powers of 1/1.1673040 (Roberts 2018, four dimensions)
 _REDUCED = 0.25  # of the clamp distance: a bound 16 times higher
 
 Sums = dict[str, Float[Array, "n 3"]]
@@ -36,6 +39,9 @@ class Context(NamedTuple):
     mip: Float[Array, "x y z"] | None
     plan: Plan
     seed: int
+    marched: Medium | None  # what pairs march through: the medium, or a coarse copy of it
+    maps: Maps | None = None
+    tree: cKDTree | None = None  # of the lights, where maps stand for the geometry around receivers
 
 
 def zero_sums(n: int) -> Sums:
@@ -110,23 +116,52 @@ def gather_segments(context: Context, segments: Segments, index: UInt[Array, "n"
                 isotropic=plan.isotropic,
                 stratified=stratified,
             )
-            value = _evaluate_segments(context, segments, picks, block)
+            value = _evaluate_segments(context, segments, picks, name, block)
         sums[ORIGIN[name]] = sums[ORIGIN[name]] + value
     return sums
 
 
-def _evaluate_segments(context, segments, picks, block):
+def _evaluate_segments(context, segments, picks, name, block):
     plan = context.plan
     position = picking.points_of(segments, picks)
-    visible, clamps = None, None
-    if context.scene.mesh is not None:
-        rays = picking.shadow_rays(position, block, picks)
-        visible = ~jnp.asarray(ray_casting.occluded(context.caster, *rays))
+    clamps = None
     if context.mip is not None and plan.mean_free_paths is not None:
         clamps = clamp_at(context.scene, context.mip, position, plan=plan)
+    visible, columns = _between(context, picks, position, position, name, block)
     return picking.evaluate_segments(
-        segments, picks, visible, block, context.scene.medium, clamps, isotropic=plan.isotropic, num_steps=plan.pair_steps
+        segments,
+        picks,
+        visible,
+        columns,
+        block,
+        context.scene.medium,
+        context.marched,
+        clamps,
+        isotropic=plan.isotropic,
+        num_steps=plan.pair_steps,
     )
+
+
+def _between(context, picks, position, origin, name, block, *, stride=1, offset=0):
+    """Visibility of the picked lights from points (None: all), and density columns to them (None: to be marched).
+
+    `origin` is where shadow rays start. The block may hold every `stride`-th light from `offset` on.
+    """
+    plan = context.plan
+    index = None
+    if context.maps is not None:
+        index = maps.first_rows(context.lights)[name] + picks.light * stride + offset % stride
+        position = jnp.broadcast_to(position, (*index.shape, 3))
+    visible, columns = None, None
+    if context.scene.mesh is not None:
+        if plan.shadows == "maps":
+            visible = maps.visible(context.maps, index, position)
+        else:
+            rays = picking.shadow_rays(origin, block, picks)
+            visible = ~jnp.asarray(ray_casting.occluded(context.caster, *rays))
+    if plan.columns == "maps":
+        columns = maps.column(context.maps, index, position)
+    return visible, columns
 
 
 def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, stride: int, offset: int) -> Sums:
@@ -142,12 +177,10 @@ def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, str
             picks = picking.pick_for_points(
                 points, u, block, medium, num_groups=_groups(block, plan.group_size), isotropic=plan.isotropic
             )
-            visible = None
-            if context.scene.mesh is not None:
-                origin = lifted(context.scene, points)
-                visible = ~jnp.asarray(ray_casting.occluded(context.caster, *picking.shadow_rays(origin, block, picks)))
+            origin = lifted(context.scene, points)
+            between = _between(context, picks, points.position, origin, name, block, stride=stride, offset=offset)
             value = picking.evaluate_points(
-                points, picks, visible, block, medium, isotropic=plan.isotropic, num_steps=plan.pair_steps
+                points, picks, *between, block, medium, context.marched, isotropic=plan.isotropic, num_steps=plan.pair_steps
             )
         sums[ORIGIN[name]] = sums[ORIGIN[name]] + value
     return sums
@@ -218,7 +251,7 @@ def compensate(
     plan, scene = context.plan, context.scene
     sums = zero_sums(index.shape[0])
     for level in range(plan.num_levels):
-        u = _chain_uniforms(context.seed, index, jnp.int32(chain * plan.num_levels + level))
+        u = _chain_uniforms(context.seed, index, jnp.int32(level), jnp.int32(chain))
         proposal = _propose(scene, points, u, lit=lit)
         s, face = _surface_within(context, points, proposal)
         arguments = (scene, context.mip, points, proposal, throughput, s, face, u)
@@ -260,8 +293,12 @@ def _gather_at_end(context, points, u, chain, level):
 
 
 @jax.jit
-def _chain_uniforms(seed, index, dimension):
-    return sum((sampling.uniforms(seed, _CHAIN, index, 4 * dimension + i) for i in range(3)), ())
+def _chain_uniforms(seed, index, level, chain):
+    """Twelve uniforms of a level: those of direction and distance go on from chain to chain by an additive recurrence."""
+    own = sum((sampling.uniforms(seed, _CHAIN, index, 4 * level + i + 64 * chain) for i in range(3)), ())
+    first = sum((sampling.uniforms(seed, _CHAIN, index, 4 * level + i) for i in range(3)), ())
+    spread = dict(zip((0, 1, 9, 3), _RECURRENCE, strict=True))
+    return tuple(gathering.shifted(first[i], spread[i] * chain) if i in spread else own[i] for i in range(12))
 
 
 @partial(jax.jit, static_argnames="lit")
@@ -279,8 +316,9 @@ def _advance(scene, mip, points, proposal, throughput, s, face, u, *, plan):
     sigma = compensation.local_sigma(scene.medium, mip, points.position)
     step = compensation.choose_kind(scene, points, s, face, u[4])
     t, factor = compensation.distance_onwards(points, step, u[3], sigma, distance=plan.distance)
+    even = compensation.is_even(scene.medium, mip, points.position, points.clamp)
     found, gain = compensation.new_vertices(
-        scene, points, proposal, step, t, factor, sigma, transmittance=plan.transmittance, num_steps=_steps_within(plan)
+        scene, points, proposal, step, t, factor, sigma, even, transmittance=plan.transmittance, num_steps=_steps_within(plan)
     )
     found = with_clamp(found, clamp_at(scene, mip, found.position, plan=plan))
     return found, throughput * gain
@@ -293,8 +331,9 @@ def _towards_light(scene, mip, points, proposal, throughput, s, face, u, *, plan
     step = compensation.choose_kind(scene, points, s, face, u[4])
     target = primary.sample_light(scene, points.position, u[6], u[7], u[8]).position
     t, factor = compensation.distance_to_light(points, proposal, step, u[9], target)
+    even = compensation.is_even(scene.medium, mip, points.position, points.clamp)
     found, gain = compensation.new_vertices(
-        scene, points, proposal, step, t, factor, sigma, transmittance=plan.transmittance, num_steps=_steps_within(plan)
+        scene, points, proposal, step, t, factor, sigma, even, transmittance=plan.transmittance, num_steps=_steps_within(plan)
     )
     # The same numbers lead to the same point of the same light.
     sample, origin = compensation.sample_primary(scene, found, u[6], u[7], u[8])
@@ -338,4 +377,8 @@ def _surface_within(context, points, proposal):
     n = points.position.shape[0]
     if context.scene.mesh is None or context.plan.visibility == "none":
         return jnp.full(n, jnp.inf, jnp.float32), jnp.full(n, -1, jnp.int32)
+    if context.plan.visibility == "maps":
+        index = maps.nearest_lights(context.tree, points.position)
+        rays = (proposal.origin, proposal.direction, points.clamp)
+        return maps.surface_within(context.maps, context.scene.mesh, index, *rays)
     return ray_casting.intersect(context.caster, proposal.origin, proposal.direction, points.clamp)

@@ -88,7 +88,7 @@ def test_groups_of_one_are_the_full_gather(segments, lights):
     u = floats(0.1, 0.4, 0.6, 0.9)
     full = gathering.gather_segments(segments, u, lights, medium, grey=True, isotropic=False)
     picks = picking.pick_for_segments(segments, u, u, lights, medium, num_groups=NUM, isotropic=False)
-    found = picking.evaluate_segments(segments, picks, None, lights, medium, None, isotropic=False, num_steps=4)
+    found = picking.evaluate_segments(segments, picks, None, None, lights, medium, medium, None, isotropic=False, num_steps=4)
     np.testing.assert_allclose(np.asarray(found), np.asarray(full), rtol=2e-4)
 
 
@@ -103,7 +103,7 @@ def test_picking_is_unbiased(segments, lights):
 
     def total(groups):
         picks = picking.pick_for_segments(many, u, u_group, lights, medium, num_groups=groups, isotropic=False)
-        found = picking.evaluate_segments(many, picks, None, lights, medium, None, isotropic=False, num_steps=8)
+        found = picking.evaluate_segments(many, picks, None, None, lights, medium, medium, None, isotropic=False, num_steps=8)
         return np.asarray(found).reshape(4, n, 3)
 
     some, everything = total(8), total(NUM)
@@ -121,7 +121,7 @@ def test_points_gather_what_a_sum_says(lights):
     found = np.asarray(gathering.gather_points(points, lights, medium, grey=True, isotropic=False))
     assert np.all(np.isfinite(found))
     picks = picking.pick_for_points(points, jnp.full(3, 0.3), lights, medium, num_groups=NUM, isotropic=False)
-    same = picking.evaluate_points(points, picks, None, lights, medium, isotropic=False, num_steps=1)
+    same = picking.evaluate_points(points, picks, None, None, lights, medium, medium, isotropic=False, num_steps=1)
     np.testing.assert_allclose(np.asarray(same), found, rtol=2e-4)
     p, d, s = (np.asarray(v, np.float64) for v in (lights.position, lights.direction, lights.strength))
     delta = np.asarray(position[1], np.float64) - p
