@@ -5,7 +5,6 @@ rest inside `stoppable()` and reports through `progress()`.
 """
 
 import hashlib
-import io
 import json
 import os
 import re
@@ -134,22 +133,26 @@ class Parts:
         if digest is None:
             return None
         try:
-            data = self._file(name, digest).read_bytes()
+            with open(self._file(name, digest), "rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+                if found != digest:
+                    return self._drop(name, "does not match its checksum (truncated or edited)")
+                file.seek(0)
+                with np.load(file, allow_pickle=False) as arrays:
+                    return {key: arrays[key] for key in arrays.files}
         except OSError as error:
             return self._drop(name, f"cannot be read ({error.strerror})")
-        if hashlib.sha256(data).hexdigest() != digest:
-            return self._drop(name, "does not match its checksum (truncated or edited)")
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return {key: arrays[key] for key in arrays.files}
 
     def put(self, name: str, arrays: Mapping[str, Any]) -> None:
         """Save a finished part; returns when it is on disk. Raises ValueError for a bad name or arrays of objects."""
         if not _PART_NAME.fullmatch(name):
             raise ValueError(f"part name {name!r} must match {_PART_NAME.pattern}")
         plain = {key: np.asarray(value) for key, value in arrays.items()}
-        data = _npz_bytes(plain)
-        digest, old = hashlib.sha256(data).hexdigest(), self._digests.get(name)
-        write_bytes(self._file(name, digest), data)
+        sha256 = hashlib.sha256()  # names the file, so it is known first: twice the work, but no copy of large arrays
+        _write_npz(sha256.update, plain)
+        digest, old = sha256.hexdigest(), self._digests.get(name)
+        with atomic_write(self._file(name, digest)) as temporary, open(temporary, "wb") as file:
+            _write_npz(file.write, plain)
         self._digests[name] = digest
         self._save_manifest()
         if old is not None and old != digest:
@@ -196,16 +199,28 @@ class Parts:
                 file.unlink(missing_ok=True)
 
 
-def _npz_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """An uncompressed .npz in memory; like `np.savez`, but any key will do, pickles will not, and no clock goes in."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:
+class _Sink:
+    """A file of which zipfile knows only how to write: the same bytes come out whatever takes them."""
+
+    def __init__(self, take: Callable[[bytes], Any]):
+        self._take = take
+
+    def write(self, data: bytes) -> int:
+        self._take(data)
+        return len(data)
+
+    def flush(self) -> None:
+        """Whoever takes the bytes flushes them."""
+
+
+def _write_npz(take: Callable[[bytes], Any], arrays: Mapping[str, np.ndarray]) -> None:
+    """Hand over an uncompressed .npz piece by piece; like `np.savez`, but for any key, without pickles and clocks."""
+    with zipfile.ZipFile(_Sink(take), "w") as archive:
         for key, value in arrays.items():
             if value.dtype.hasobject:
                 raise ValueError(f"array {key!r} holds Python objects; a part holds numbers only")
             with archive.open(zipfile.ZipInfo(key + ".npy"), "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, value, allow_pickle=False)
-    return buffer.getvalue()
 
 
 def _differing_keys(a: Any, b: Any, prefix: str = "") -> list[str]:

@@ -7,6 +7,9 @@ numbers T1 to T13 are those of the project's list of test problems.
 import math
 from typing import NamedTuple
 
+import numpy as np
+from scipy.optimize import brentq
+
 # T2. Infinite medium, isotropic point source of power 1, isotropic scattering: fluence phi(r) (Case, de Hoffmann and
 # Placzek 1953), k = inverse diffusion length. A light of intensity 1 has power 4 pi.
 POINT_SOURCE_RADII = (0.5, 1.0, 2.0, 5.0, 10.0)
@@ -126,3 +129,60 @@ KOBAYASHI = Kobayashi()
 
 # T13. Infinite floor of radiosity pi Le in fog: irradiance scattered once back onto itself, over c pi Le.
 FLOOR_IN_FOG = (2.0 / 3.0) * (1.0 - math.log(2.0))
+
+
+def point_source_fluence(r, c: float) -> np.ndarray:
+    """T2 at any radii, by quadrature of the transient part; relative accuracy 1e-10 from r = .05 up."""
+    r = np.asarray(r, np.float64)
+    k = _inverse_diffusion_length(c)
+    y, weight = _FLUENCE_NODES  # m = tanh(y): the logarithm at m = 1 becomes linear
+    m = np.tanh(y)
+    spectrum = weight * (1 / m**2 - 1) / ((1 - c * m * y) ** 2 + (0.5 * c * math.pi * m) ** 2)
+    transient = np.exp(-r[..., None] / m) @ spectrum
+    steady = 2 * k**2 * (1 - k**2) / (c * (k**2 + c - 1)) * np.exp(-k * r)
+    return (steady + transient) / (4 * math.pi * r)
+
+
+def _inverse_diffusion_length(c: float) -> float:
+    return float(brentq(lambda k: c * math.atanh(k) / k - 1.0, 1e-6, 1 - 1e-15, xtol=1e-15, rtol=1e-14))
+
+
+def _gauss_legendre(low: float, high: float, num: int) -> tuple[np.ndarray, np.ndarray]:
+    node, weight = np.polynomial.legendre.leggauss(num)
+    return 0.5 * (high + low) + 0.5 * (high - low) * node, 0.5 * (high - low) * weight
+
+
+_FLUENCE_NODES = tuple(np.concatenate(x) for x in zip(_gauss_legendre(0, 3, 300), _gauss_legendre(3, 20, 100), strict=True))
+
+
+def point_source_radiance(position, direction, c: float) -> float:
+    """T2. Radiance arriving at `position` along `direction` (of the ray from the eye) in the same medium, scattered light only.
+
+    Isotropic scattering re-emits the fluence: L = c / (4 pi) int exp(-t) phi(|position + t direction|) dt. The ray must
+    not pass through the source, which stands at the origin.
+    """
+    position, direction = np.asarray(position, np.float64), np.asarray(direction, np.float64)
+    nearest = -position @ direction
+    pieces = [0.0, *(nearest + x for x in (-1.0, -0.3, 0.0, 0.3, 1.0, 4.0) if nearest + x > 0), max(nearest, 0.0) + 45.0]
+    total = 0.0
+    for low, high in zip(pieces[:-1], pieces[1:], strict=True):
+        t, weight = _gauss_legendre(low, high, 80)
+        r = np.linalg.norm(position + t[:, None] * direction, axis=1)
+        total += weight @ (np.exp(-t) * point_source_fluence(r, c))
+    return c / (4 * math.pi) * float(total)
+
+
+def half_space_radiance(mu: float, mu0: float, c: float, h_mu: float, h_mu0: float) -> float:
+    """T3. Radiance reflected at cosine mu for collimated light of unit irradiance (across its beam) at cosine mu0."""
+    return c / (4 * math.pi) * mu0 / (mu + mu0) * h_mu * h_mu0
+
+
+def thick_slab_reflectance(tau: float, h_mu0: float) -> float:
+    """T3, T3a. Conservative isotropic slab at cosine mu0, up to terms of exp(-tau): 1 - H(mu0) / (sqrt 3 (tau + 2 q))."""
+    return 1.0 - h_mu0 / (math.sqrt(3.0) * (tau + 2.0 * EXTRAPOLATION_LENGTH))
+
+
+def airlight_in_vacuum(distance: float, angle: float, length: float) -> float:
+    """T7 at sigma_t = 0 on a ray of finite length."""
+    across, along = distance * math.sin(angle), distance * math.cos(angle)
+    return (math.atan((length - along) / across) + math.atan(along / across)) / across
