@@ -204,18 +204,25 @@ def _medium(key: str, table: InclusionTable, base: Path, notes: list[str]) -> Me
     table_of_moments = None if table.phase is None else _phase(f"{key}.phase", table.phase, base)
     g = (table.anisotropy or 0.0) if table_of_moments is None else _mean_cosine(table_of_moments)
     inclusions = table.inclusions if isinstance(table, MediumTable) else ()
+    sigma_s = _sigma(f"{key}.scattering", table.scattering, scale)
+    sigma_a = _sigma(f"{key}.absorption", table.absorption, scale)
     return Medium(
         bounds=jnp.asarray(np.asarray(bounds), jnp.float32),
-        sigma_s=_sigma(f"{key}.scattering", table.scattering, scale),
-        sigma_a=_sigma(f"{key}.absorption", table.absorption, scale),
+        sigma_s=sigma_s,
+        sigma_a=sigma_a,
         g=jnp.float32(g),
         density=None if density is None else jnp.asarray(density),
-        majorants=None if density is None else media.majorants(density),
+        majorants=None if density is None else _majorants(density, np.asarray(bounds), np.asarray(sigma_s + sigma_a)),
         phase=table_of_moments,
         ior=_refractive_index(f"{key}.refractive_index", table.refractive_index, base),
         boundary=boundary,
         inclusions=tuple(_medium(f"{key}.inclusions.{i}", t, base, notes) for i, t in enumerate(inclusions)),
     )
+
+
+def _majorants(density, bounds, sigma_t):
+    voxel_size = float(np.min((bounds[1] - bounds[0]) / density.shape))
+    return media.majorants(density, block=media.majorant_block(density, sigma_t=float(sigma_t.max()), voxel_size=voxel_size))
 
 
 def _sigma(key: str, value: Sequence[float], scale: float):

@@ -184,3 +184,11 @@ def test_density_has_the_gradient_of_the_interpolant_and_compiles_once():
 def medium_with(density):
     base = medium(np.ones(density.shape, np.float32))
     return Medium(base.bounds, base.sigma_s, base.sigma_a, base.g, density, base.majorants)
+
+
+def test_majorant_blocks_grow_where_collisions_are_rare():
+    grid = np.zeros((32, 32, 32), np.float32)
+    grid[9:11] = 1.0
+    thin = media.majorant_block(grid, sigma_t=1e-3, voxel_size=1.0)
+    thick = media.majorant_block(grid, sigma_t=1e3, voxel_size=1.0)
+    assert (thin, thick) == (16, 4)

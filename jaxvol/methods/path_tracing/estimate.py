@@ -1,8 +1,9 @@
 """Plan, run and turn the film into layers with their variance."""
 
 import os
+import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -65,8 +66,8 @@ def plan(
     """Decide what a path tracer of this scene has to do; eager.
 
     `max_scatterings` counts vertices of any kind; `roulette_from` is the number of vertices from which Russian roulette
-    may end a path; `equiangular=None` uses equi-angular distances where lights stand in or near a
-    medium. Raises ValueError for a refractive index other than 1 and for counts out of range.
+    may end a path; `equiangular=None` uses equi-angular distances where lights stand in a medium,
+    or near a fog. Raises ValueError for a refractive index other than 1 and for counts out of range.
     """
     if max_scatterings < 0:
         raise ValueError(f"max_scatterings: {max_scatterings} is not allowed, must be >= 0")
@@ -80,7 +81,9 @@ def plan(
     medium = None if drop_medium else scene.medium
     tracked = medium is not None and not media.is_homogeneous(medium)
     lit = lights.num_lights(scene) > 0
-    near = medium is not None and _light_near(scene, medium)
+    # Where distances are tracked or bodies end early, a vertex near the light is worth its flight only inside.
+    fog = medium is not None and not tracked and segments.is_box(medium)
+    near = medium is not None and _light_near(scene, medium, 0.5 if fog else 0.0)
     use_equiangular = near if equiangular is None else equiangular
     placed = any(x is not None for x in (scene.point_lights, scene.spot_lights, scene.area_lights))
     if use_equiangular and (medium is None or not placed):
@@ -114,10 +117,10 @@ def _refuse_refraction(medium: Medium) -> None:
             )
 
 
-def _light_near(scene, medium):
-    """Whether a light stands within the medium's box enlarged by half its size."""
+def _light_near(scene, medium, share):
+    """Whether a light stands within the medium's box enlarged by a share of its size on each side."""
     bounds = np.asarray(medium.bounds)
-    margin = 0.5 * (bounds[1] - bounds[0])
+    margin = share * (bounds[1] - bounds[0])
     positions = [np.asarray(x.position) for x in (scene.point_lights, scene.spot_lights) if x is not None]
     if scene.area_lights is not None:
         corners = np.asarray(scene.mesh.faces)[np.asarray(scene.area_lights.face)]
@@ -158,8 +161,8 @@ def add_samples(
 ) -> None:
     """Trace `num_samples` more samples of every pixel into `film` [2, P, columns], in ranges that bound the memory.
 
-    Samples are numbered, so the film does not depend on how they are split, beyond rounding. `on_progress(share)` may
-    raise to give up; the film is then of no use.
+    Samples are numbered, so the film does not depend on how they are split, beyond rounding. `on_progress(share)`, which
+    one thread at a time calls, may raise to give up; the film is then of no use.
     """
     if plan.drop_medium:
         scene = Scene(**{**{f: getattr(scene, f) for f in Scene.__dataclass_fields__}, "medium": None})
@@ -170,13 +173,18 @@ def add_samples(
     cuts = [num_samples * i // shares for i in range(shares + 1)]
     jobs = [(p, low, high) for p in pixels for low, high in zip(cuts[:-1], cuts[1:], strict=True)]
     done = [0.0] * len(jobs)
+    reporting, leaving = threading.Lock(), threading.Event()
 
     def trace(number):
         (first, count), low, high = jobs[number]
 
         def report(share):
-            done[number] = share
-            on_progress(sum(done) / len(done))
+            if leaving.is_set():
+                raise CancelledError
+            if on_progress is not None:
+                with reporting:
+                    done[number] = share
+                    on_progress(sum(done) / len(done))
 
         return driver.run(
             scene,
@@ -192,16 +200,21 @@ def add_samples(
             num_pixels=count,
             first_sample=first_sample + low,
             num_samples=high - low,
-            on_step=None if on_progress is None else report,
+            on_step=report,
         )
 
     with ThreadPoolExecutor(shares) as pool:
-        for begin in range(0, len(jobs), shares):
-            parts = [pool.submit(trace, number) for number in range(begin, begin + shares)]
-            (first, count), _, _ = jobs[begin]
-            for part in parts:  # in order, so that a render repeats to the last bit
-                film[:, first : first + count] += part.result().reshape(2, count, -1)
-            done[begin : begin + shares] = [1.0] * shares
+        try:
+            for begin in range(0, len(jobs), shares):
+                parts = [pool.submit(trace, number) for number in range(begin, begin + shares)]
+                for part in wait(parts, return_when=FIRST_EXCEPTION).done:
+                    part.result()  # raises what the part raised
+                (first, count), _, _ = jobs[begin]
+                for part in parts:  # in order, so that a render repeats to the last bit
+                    film[:, first : first + count] += part.result().reshape(2, count, -1)
+                done[begin : begin + shares] = [1.0] * shares
+        finally:
+            leaving.set()  # after an error or Ctrl-C the other threads need not finish their shares
 
 
 def host_threads() -> int:
@@ -223,8 +236,10 @@ def lanes_for(items: int, limit: int) -> int:
     return min(lanes, limit)
 
 
-def film_to_layers(film: np.ndarray, groups: tuple[int, ...], num_samples: int) -> tuple[dict, dict]:
-    """Means and variances of the mean of each layer [P, 3], with the total under "total"; numpy float32.
+def film_to_layers(
+    film: np.ndarray, groups: tuple[int, ...], num_samples: int, *, only: str | None = None
+) -> tuple[dict, dict]:
+    """Means and variances of the mean of each layer [P, 3] (or of one), with the total under "total"; numpy float32.
 
     The variance is that of independent samples: (E[x^2] - E[x]^2) / (n - 1); 0 for a single sample.
     """
@@ -241,6 +256,8 @@ def film_to_layers(film: np.ndarray, groups: tuple[int, ...], num_samples: int) 
                 sources[f"{kind}_from_{source}"] = (slice(row, row + 1), column[group])
     mean, variance = {}, {}
     for name, (rows, index) in sources.items():
+        if only not in (None, name):
+            continue
         average = values[rows, :, 0, index].sum(axis=0, dtype=np.float64) / num_samples
         square = values[rows, :, 1, index].sum(axis=0, dtype=np.float64) / num_samples
         mean[name] = average.astype(np.float32)
@@ -253,7 +270,7 @@ def to_estimate(film: np.ndarray, plan: Plan, num_samples: int, shape: tuple[int
     mean, variance = film_to_layers(film, plan.groups, num_samples)
     zeros = np.zeros((film.shape[1], 3), np.float32)
     full = lambda found: Layers(  # noqa: E731
-        **{name: jnp.asarray(found.get(name, zeros).reshape(*shape, 3)) for name in layer_classes.NAMES}
+        **{name: jnp.asarray(found.pop(name, zeros).reshape(*shape, 3)) for name in layer_classes.NAMES}
     )
     spread = full(variance)
     whole = {"+".join(layer_classes.NAMES): jnp.asarray(variance["total"].reshape(*shape, 3))}
