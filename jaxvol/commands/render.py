@@ -1,5 +1,6 @@
 """`jaxvol render`: a scene file to an EXR with all layers, a PNG and a JSON report."""
 
+import math
 import sys
 import time
 from pathlib import Path
@@ -76,7 +77,9 @@ def _report_job(result: rendering.Rendering, stopped: bool) -> None:
         _say(f"resumed after {int(found['resumed_samples'])} samples a pixel of an earlier run")
     if "error" in found:
         spent = f"{int(result.estimate.num_samples)} samples a pixel"
-        _say(f"error {float(found['error']):.2%} (standard error of 8 x 8 blocks over the mean) with {spent}")
+        known = math.isfinite(found["error"])
+        error = f"{float(found['error']):.2%}" if known else "unknown"
+        _say(f"error {error} (standard error of 8 x 8 blocks over the mean) with {spent}")
     if not bool(found.get("converged", True)):
         _say(f"warning: the solve did not converge, residual {float(np.max(found['residual'])):.1e}; allow more applications")
     if stopped:

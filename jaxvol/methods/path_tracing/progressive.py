@@ -19,6 +19,7 @@ _LEAST_SAMPLES = 64
 _FIRST_BATCH = 1 << 18  # paths: enough to keep the lanes busy, few enough that there soon is something to show
 _BATCH_SECONDS = 8.0
 _SAVE_SECONDS = 10.0
+_LARGE_FILM = 1 << 28  # bytes
 
 
 class _GivenUp(Exception):
@@ -47,22 +48,24 @@ def render(
     values out of range.
     """
     _check(samples, seconds, until_error)
-    film, done = empty_film(camera, plan), 0
+    film, done, batches = empty_film(camera, plan), 0, 0
     if parts is not None and (saved := parts.get("accumulator")) is not None:
-        film, done = saved["film"], int(saved["samples"])
+        film, done, batches = saved["film"], int(saved["samples"]), int(saved.get("batches", 0))
     resumed = done
     shape = (camera.height, camera.width)
     lanes = lanes_for(camera.height * camera.width * _LEAST_SAMPLES, plan.num_lanes)  # one compilation for all batches
     limit = samples if seconds is None and until_error is None else None
     begin = saved_at = time.monotonic()
-    batches, batch, error, stopped = 0, _first_batch(camera, until_error), math.inf, False
+    batch, error, stopped = _first_batch(camera, until_error), block_error(film, plan, done, shape), False
+    # A large film has no second beside it for the batch: then the batch that was begun is finished.
+    large = film.nbytes > _LARGE_FILM
     while not _enough(done, limit, error, until_error, batches, seconds, time.monotonic() - begin):
         size = batch if limit is None else min(batch, limit - done)
         started = time.monotonic()
-        added = np.zeros_like(film)
+        added = film if large else np.zeros_like(film)
 
         target = (limit, error, until_error, seconds, begin)
-        report = partial(_report, on_progress, stop if done else None, done, size, target)
+        report = partial(_report, on_progress, stop if done and not large else None, done, size, target)
         try:
             add_samples(
                 added,
@@ -80,12 +83,13 @@ def render(
         except _GivenUp:
             stopped = True
             break
-        film += added
+        if not large:
+            film += added
         done, batches = done + size, batches + 1
         error = block_error(film, plan, done, shape)
         took = time.monotonic() - started
         if parts is not None and time.monotonic() - saved_at > _SAVE_SECONDS:
-            parts.put("accumulator", {"film": film, "samples": np.int64(done)})
+            parts.put("accumulator", {"film": film, "samples": np.int64(done), "batches": np.int64(batches)})
             saved_at = time.monotonic()
         if stop:
             stopped = True
@@ -97,7 +101,7 @@ def render(
             batch = max(1, min(batch, int(left / max(took / size, 1e-6))))
     if parts is not None:
         if stopped:
-            parts.put("accumulator", {"film": film, "samples": np.int64(done)})
+            parts.put("accumulator", {"film": film, "samples": np.int64(done), "batches": np.int64(batches)})
         else:
             parts.clear()
     estimate = to_estimate(film, plan, done, shape)
@@ -161,7 +165,7 @@ def block_error(film: np.ndarray, plan: Plan, num_samples: int, shape: tuple[int
     """
     if num_samples < 2:
         return math.inf
-    mean, variance = film_to_layers(film, plan.groups, num_samples)
+    mean, variance = film_to_layers(film, plan.groups, num_samples, only="total")
     height, width = (size - size % _BLOCK if size >= _BLOCK else size for size in shape)
     rows, columns = max(height // _BLOCK, 1), max(width // _BLOCK, 1)
     cut = variance["total"].reshape(*shape, 3)[:height, :width].astype(np.float64)

@@ -1,5 +1,11 @@
 """Rendering as a job: resumed to the same picture, stopped with what is there, ended by error or time."""
 
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import CancelledError
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,7 +14,7 @@ from jaxvol import layers
 from jaxvol.camera import look_at
 from jaxvol.jobs import Parts, Stop
 from jaxvol.methods import path_tracing
-from jaxvol.methods.path_tracing import progressive
+from jaxvol.methods.path_tracing import estimate, progressive
 from jaxvol.types import Camera, Medium, PointLights, Scene
 
 
@@ -17,8 +23,7 @@ def small_batches(monkeypatch):
     monkeypatch.setattr(progressive, "_FIRST_BATCH", 16 * 256)
 
 
-@pytest.fixture(scope="module")
-def fog():
+def fog_scene():
     medium = Medium(
         bounds=jnp.asarray([[-1.0, -1, -1], [1, 1, 1]]),
         sigma_s=jnp.full(3, 0.8),
@@ -30,11 +35,20 @@ def fog():
     return scene, camera, path_tracing.plan(scene, camera, num_lanes=1024)
 
 
+@pytest.fixture(scope="module")
+def fog():
+    return fog_scene()
+
+
 def picture(estimate):
     return np.asarray(layers.total(estimate.mean))
 
 
-def test_a_stopped_job_resumes_to_the_same_picture(fog, tmp_path):
+@pytest.mark.parametrize("large", [False, True])
+def test_a_stopped_job_resumes_to_the_same_picture(fog, tmp_path, monkeypatch, large):
+    """Also where the film is too large to have a second one beside it."""
+    if large:
+        monkeypatch.setattr(progressive, "_LARGE_FILM", 0)
     scene, camera, plan = fog
     whole = path_tracing.render(scene, camera, plan, samples=96, seed=2)
     config = {"scene": path_tracing.scene_digest(scene, camera)}
@@ -51,6 +65,72 @@ def test_a_stopped_job_resumes_to_the_same_picture(fog, tmp_path):
     assert int(rest.diagnostics["resumed_samples"]) == int(part.num_samples) and int(rest.num_samples) == 96
     assert np.allclose(picture(rest), picture(whole), rtol=1e-5, atol=1e-7)
     assert not (tmp_path / "parts").exists()  # a finished job leaves nothing behind
+
+
+_CHILD = """
+import sys
+from jaxvol.jobs import Parts
+from jaxvol.methods import path_tracing
+from jaxvol.methods.path_tracing import progressive
+from tests.methods.path_tracing.test_progressive import fog_scene
+progressive._FIRST_BATCH, progressive._SAVE_SECONDS, progressive._BATCH_SECONDS = 16 * 256, 0.0, 0.2
+scene, camera, plan = fog_scene()
+path_tracing.render(scene, camera, plan, samples=4000, seed=2, parts=Parts(sys.argv[1], config={}))
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_job_resumes_to_the_same_picture(root, tmp_path):
+    """SIGKILL in the middle of a batch: what was saved before is whole, and the rest is the rest."""
+    child = subprocess.Popen([sys.executable, "-c", _CHILD, tmp_path / "parts"], cwd=root)
+    while child.poll() is None and not list((tmp_path / "parts").glob("accumulator-*.npz")):
+        time.sleep(0.05)
+    time.sleep(0.5)
+    child.kill()
+    assert child.wait() == -signal.SIGKILL, "it ended before it could be killed"
+    scene, camera, plan = fog_scene()
+    rest = path_tracing.render(scene, camera, plan, samples=4000, seed=2, parts=Parts(tmp_path / "parts", config={}))
+    assert 0 < int(rest.diagnostics["resumed_samples"]) < 4000 and int(rest.num_samples) == 4000
+    whole = path_tracing.render(scene, camera, plan, samples=4000, seed=2)
+    for a, b in ((rest.mean, whole.mean), (rest.variance, whole.variance)):
+        for name, image in layers.items(a):
+            other = np.asarray(dict(layers.items(b))[name])
+            np.testing.assert_allclose(np.asarray(image), other, rtol=2e-5, atol=1e-6 * other.max(), err_msg=name)
+
+
+def test_an_error_in_one_thread_ends_the_others_and_is_told(fog, monkeypatch):
+    scene, camera, plan = fog
+    told_to_leave = []
+
+    def run(*_, first_sample, on_step, **__):
+        if first_sample:  # the second share
+            raise OSError("broken")
+        try:
+            for _ in range(1000):
+                time.sleep(0.01)
+                on_step(0.0)
+        except CancelledError:
+            told_to_leave.append(True)
+            raise
+
+    monkeypatch.setattr(estimate.driver, "run", run)
+    monkeypatch.setattr(estimate, "host_threads", lambda: 2)
+    with pytest.raises(OSError, match="broken"):
+        path_tracing.render(scene, camera, plan, samples=8)
+    assert told_to_leave
+
+
+def test_a_resumed_job_remembers_its_batches(fog, tmp_path):
+    """What was good enough when it was stopped is good enough at once."""
+    scene, camera, plan = fog
+    found = path_tracing.render(scene, camera, plan, samples=640)
+    parts, film = Parts(tmp_path / "parts", config={}), estimate.empty_film(camera, plan)
+    estimate.add_samples(film, scene, camera, plan, seed=0, first_sample=0, num_samples=640, num_lanes=1024)
+    parts.put("accumulator", {"film": film, "samples": np.int64(640), "batches": np.int64(16)})
+    goal = 1.1 * float(found.diagnostics["error"])
+    resumed = path_tracing.render(scene, camera, plan, until_error=goal, parts=parts)
+    assert int(resumed.num_samples) == int(resumed.diagnostics["resumed_samples"]) == 640
+    assert np.allclose(picture(resumed), picture(found), rtol=1e-5)
 
 
 def test_until_error_stops_at_the_error_it_names(fog):
