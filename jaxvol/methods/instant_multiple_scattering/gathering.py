@@ -4,6 +4,7 @@ Receivers lie along the lanes, a scan runs over the lights (section 4.2; specifi
 light at one point of its own, chosen by softened equi-angular sampling, or, as the paper does, at stratified points.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -151,13 +152,18 @@ def add(total: Vector, value: Vector) -> Vector:
     return total[0] + value[0], total[1] + value[1], total[2] + value[2]
 
 
-def _sum_over(function, lights, sigma_t, num_lanes, *, grey, repeats=1):
+def sum_over(
+    function: Callable, lights: NamedTuple, sigma_t: Vector, num_lanes: int, *, grey: bool, repeats: int = 1
+) -> Float[Array, "n 3"]:
     """Sum of strength * scale * exp(-sigma_t column) over all lights, (scale, column) = function(light, shift, repeat).
+
+    `lights`: rows [M] to scan over, among them `strength`.
 
     The lanes are [k, n]: k lights at once, so that few receivers still give a step enough to do. What a step computes goes
     into the sum one step later, through the scan's state: XLA would else compute it again in each channel's loop.
     """
-    number = lights.position.shape[0] * repeats
+    count = lights.strength[0].shape[0]
+    number = count * repeats
     k = max(1, min(_WIDTH // max(num_lanes, 1), number))
     steps = -(-number // k)
 
@@ -180,10 +186,10 @@ def _sum_over(function, lights, sigma_t, num_lanes, *, grey, repeats=1):
 
     zero = jnp.zeros((k, num_lanes), jnp.float32)
     dark = jnp.zeros((k, 1), jnp.float32)
-    index = jnp.arange(lights.position.shape[0])
-    which = jnp.tile(jnp.arange(repeats, dtype=jnp.float32), index.shape[0]).reshape(-1)
+    index = jnp.arange(count)
+    which = jnp.tile(jnp.arange(repeats, dtype=jnp.float32), count)
     items = (
-        *jax.tree.map(rows_of, (rows(lights), golden(index))),
+        *jax.tree.map(rows_of, (lights, golden(index))),
         jnp.pad(which, (0, steps * k - number)).reshape(steps, k, 1),
     )
     start = ((zero, zero, zero), ((dark, dark, dark), zero, zero[:1, :1] if grey else zero))
@@ -191,7 +197,7 @@ def _sum_over(function, lights, sigma_t, num_lanes, *, grey, repeats=1):
     return jnp.stack([jnp.sum(part, axis=0) for part in collect(total, late)], axis=-1)
 
 
-def _in_tiles(function, *arrays):
+def in_tiles(function: Callable, *arrays: Array | None) -> Float[Array, "n 3"]:
     """function(*arrays) over tiles of the first axis that fit the cache; scalars and None go along as they are."""
     n = arrays[0].shape[0]
     tiles = max(1, n // _TILE)
@@ -231,9 +237,9 @@ def gather_segments(
             sent = phase_value(medium, pairs.dot(light.direction, point.towards), isotropic=isotropic)
             return point.weight * (sent * f * (1.0 / num_evaluations)), point.distance + (point.t - t0)
 
-        return _sum_over(evaluate, lights, sigma_t, u.shape[0], grey=grey, repeats=num_evaluations)
+        return sum_over(evaluate, rows(lights), sigma_t, u.shape[0], grey=grey, repeats=num_evaluations)
 
-    collected = _in_tiles(tile, segments.origin, segments.direction, segments.t0, segments.t1, u) * medium.sigma_s
+    collected = in_tiles(tile, segments.origin, segments.direction, segments.t0, segments.t1, u) * medium.sigma_s
     return jnp.where((segments.t1 > segments.t0)[:, None], collected, 0.0)
 
 
@@ -254,6 +260,6 @@ def gather_points(points: Points, lights: VirtualLights, medium: Medium, *, grey
             sent = phase_value(medium, pairs.dot(light.direction, towards), isotropic=isotropic)
             return pairs.inverse_square(r2, clamp) * (sent * f), r2 * inverse
 
-        return _sum_over(evaluate, lights, sigma_t, position[0].shape[0], grey=grey)
+        return sum_over(evaluate, rows(lights), sigma_t, position[0].shape[0], grey=grey)
 
-    return points.scattering * _in_tiles(tile, points.position, points.outgoing, points.clamp)
+    return points.scattering * in_tiles(tile, points.position, points.outgoing, points.clamp)

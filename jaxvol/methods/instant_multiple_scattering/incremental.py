@@ -65,7 +65,8 @@ def reweighted(old: Scene, new: Scene, vertices: Vertices, *, seed: int, num_ste
         rows = np.flatnonzero(depth == d)  # sorted by path and depth: the row before is the vertex before
         change[rows] *= change[rows - 1] * scattering[rows - 1]
     incident = (vertices.incident * change).astype(np.float32)
-    return eqx.tree_at(lambda v: (v.incident, v.density), vertices, (incident, density))
+    power = (vertices.power * change * scattering).astype(np.float32)
+    return eqx.tree_at(lambda v: (v.incident, v.power, v.density), vertices, (incident, power, density))
 
 
 def touched_paths(

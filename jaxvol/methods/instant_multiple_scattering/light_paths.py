@@ -60,6 +60,7 @@ class Vertices(eqx.Module):
     face: Int[Array, "m"]  # -1 = in the medium
     density: Float[Array, "m"]  # of the medium there; 1 on surfaces
     outgoing: Float[Array, "m 3"]  # of travel, leaving
+    power: Float[Array, "m 3"]  # throughput that leaves; 0 where the walk ends
     continues: Bool[Array, "m"]  # the walk went on from here
     valid: Bool[Array, "m"]
 
@@ -222,6 +223,7 @@ def _interact(scene, walkers, flight, meets, hit, face, u):
         face=jnp.where(meets, face, -1),
         density=flight.density,
         outgoing=direction,
+        power=power,
         continues=alive,
         valid=interacts,
     )
@@ -370,7 +372,7 @@ def _join(parts):
     if not parts:
         index, vector = np.zeros((0,), np.int32), np.zeros((0, 3), np.float32)
         flag = np.zeros((0,), bool)
-        return Vertices(index, index, vector, vector, vector, index, np.zeros((0,), np.float32), vector, flag, flag)
+        return Vertices(index, index, vector, vector, vector, index, np.zeros((0,), np.float32), vector, vector, flag, flag)
     joined = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     order = np.lexsort((joined.depth, joined.path))
     return jax.tree.map(lambda x: x[order], joined)

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxvol import lights, media
+from jaxvol import lights as primary
+from jaxvol import media
 from jaxvol.layers import Claim
 from jaxvol.types import Camera, Scene
 
@@ -20,6 +21,7 @@ class Plan:
     num_paths: int
     num_sets: int
     max_depth: int
+    lights: str
     mean_free_paths: float | None  # clamp distance times extinction; None = unclamped
     most_clamp: float  # upper limit of the clamp distance, a length
     num_levels: int
@@ -55,6 +57,7 @@ class Plan:
 
 
 CHOICES = {
+    "lights": ("points", "rays"),
     "end": ("clamped", "unclamped", "reduced"),
     "distance": ("weight", "exponential"),
     "transmittance": ("true", "local", "detected"),
@@ -84,6 +87,7 @@ def plan(
     num_paths: int = 1024,
     num_sets: int = 1,
     max_depth: int = 256,
+    lights: str = "points",
     mean_free_paths: float | None = 0.35,
     num_levels: int = 3,
     num_chains: int = 2,
@@ -114,6 +118,7 @@ def plan(
     """Decide how to render a scene; eager.
 
     num_paths: light paths of a set; num_sets: independent sets that are averaged (two or more give a variance).
+    lights: virtual "points", or "rays": whole flights, neither clamped nor compensated (homogeneous, no surfaces).
     mean_free_paths: clamp distance d = mean_free_paths / local sigma_t, at most a tenth of the scene (None: unclamped).
     num_levels: compensation steps; 0 = clamped only (biased). num_chains: chains of new vertices per receiver
     that gather from virtual lights; num_direct: chains that only see the primary lights, which are cheap.
@@ -135,6 +140,7 @@ def plan(
     """
     _check_medium(scene)
     given = {
+        "lights": lights,
         "end": end,
         "distance": distance,
         "transmittance": transmittance,
@@ -158,19 +164,22 @@ def plan(
         raise ValueError(f"mean_free_paths: {mean_free_paths} is not allowed, must be > 0 (or none for no clamping)")
     medium = scene.medium
     values = specialize == "values"
-    lit = lights.num_lights(scene) > 0
+    lit = primary.num_lights(scene) > 0
     scatters = medium is not None and not (values and _is_dark(medium))
     reflects = scene.mesh is not None and not (values and _is_black(scene.mesh))
     tracked = medium is not None and medium.density is not None
+    if lights == "rays" and (tracked or scene.mesh is not None):
+        raise ValueError("lights: 'rays' is not allowed here, it needs a homogeneous medium and no surfaces")
     low, high = _extent(scene)
     side = float(np.max(high - low))
     return Plan(
         num_paths=num_paths,
         num_sets=num_sets,
         max_depth=max_depth,
+        lights=lights,
         mean_free_paths=mean_free_paths,
         most_clamp=0.1 * side if tracked or scene.mesh is not None else side,
-        num_levels=num_levels if mean_free_paths is not None else 0,
+        num_levels=num_levels if mean_free_paths is not None and lights == "points" else 0,
         num_chains=num_chains,
         num_direct=num_direct,
         light_stride=light_stride,

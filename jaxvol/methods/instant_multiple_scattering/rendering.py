@@ -12,7 +12,15 @@ from jaxtyping import Array, Float, UInt
 
 from jaxvol import camera as pinhole
 from jaxvol import layers, materials, media, ray_casting, sampling
-from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, maps, stages, upsampling, virtual_lights
+from jaxvol.methods.instant_multiple_scattering import (
+    compensation,
+    light_paths,
+    maps,
+    ray_lights,
+    stages,
+    upsampling,
+    virtual_lights,
+)
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.methods.instant_multiple_scattering.stages import Context
@@ -40,6 +48,12 @@ def make_context(
     """Trace a set of lights (or take the one given) and prepare what the gathering stages share."""
     caster = ray_casting.caster_for(scene.mesh, kind=plan.caster)
     counts: dict[str, int] = {}
+    if plan.lights == "rays":
+        paths = np.arange(plan.num_paths)
+        vertices, counts = light_paths.trace(scene, caster, seed=seed, paths=paths, max_depth=plan.max_depth)
+        flights = ray_lights.ray_lights(scene, vertices, num_paths=plan.num_paths, seed=seed)
+        context = Context(scene, caster, LightSet(), None, plan, seed, scene.medium, rays=flights)
+        return context, {**counts, "num_lights": len(vertices.path)}
     if lights is None:
         lights, counts = trace_lights(scene, caster, plan, seed=seed, sizes=sizes)
     medium = marched = scene.medium

@@ -15,9 +15,10 @@ from scipy.spatial import cKDTree
 
 from jaxvol import lights as primary
 from jaxvol import media, ray_casting, sampling
-from jaxvol.methods.instant_multiple_scattering import compensation, gathering, maps, picking, receivers
+from jaxvol.methods.instant_multiple_scattering import compensation, gathering, maps, picking, ray_lights, receivers
 from jaxvol.methods.instant_multiple_scattering.maps import Maps
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
+from jaxvol.methods.instant_multiple_scattering.ray_lights import RaySet
 from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import ORIGIN, LightSet, VirtualLights, blocks
 from jaxvol.types import Medium, Scene
@@ -41,6 +42,7 @@ class Context(NamedTuple):
     seed: int
     marched: Medium | None  # what pairs march through: the medium, or a coarse copy of it
     maps: Maps | None = None
+    rays: RaySet | None = None  # in the place of the lights
     tree: cKDTree | None = None  # of the lights, where maps stand for the geometry around receivers
 
 
@@ -92,6 +94,13 @@ def gather_segments(context: Context, segments: Segments, index: UInt[Array, "n"
     sums = zero_sums(index.shape[0])
     u = sampling.uniforms(context.seed, _EYE, index, 0)
     stratified = plan.sampling == "stratified"
+    if context.rays is not None:
+        for name in ("volume", "multiple"):
+            flights = getattr(context.rays, name)
+            if flights is not None:
+                options = {"grey": plan.grey, "isotropic": plan.isotropic}
+                sums[name] = ray_lights.gather_segments(segments, u[0], u[1], flights, medium, **options)
+        return sums
     for number, (name, block) in enumerate(blocks(context.lights)):
         if not plan.costly:
             value = gathering.gather_segments(

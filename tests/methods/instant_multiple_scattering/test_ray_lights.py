@@ -1,0 +1,65 @@
+"""Virtual ray lights: the sampling on a flight against quadrature, and the exact radiance in an infinite medium."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvol.methods import instant_multiple_scattering as ims
+from jaxvol.methods.instant_multiple_scattering import ray_lights, rendering
+from tests.methods.instant_multiple_scattering.scenes import floats, lit, make_camera, make_medium
+from tests.methods.instant_multiple_scattering.test_render import EXACT
+
+
+def vector(*values):
+    return tuple(jnp.float32(v) for v in values)
+
+
+@pytest.mark.parametrize("start", [(-1.0, 0.3, 0.2), (0.4, 0.001, -0.5), (2.0, 1.0, 1.0)])
+def test_points_on_a_flight_have_their_pdf(start):
+    """Mean of inverse pdf * kernel = integral of the kernel along the flight, by float64 quadrature."""
+    along = np.array([0.6, -0.3, 0.5])
+    along = along / np.linalg.norm(along)
+    n, length = 1 << 16, 3.0
+    u = (jnp.arange(n, dtype=jnp.float32) + 0.5) / n
+    v, inverse = ray_lights.sample_on_flight(
+        u, vector(0, 0, 0), vector(1, 0, 0), vector(*start), vector(*along), jnp.float32(length)
+    )
+    assert float(jnp.min(v)) >= 0.0 and float(jnp.max(v)) <= length
+
+    def kernel(x):
+        place = np.array(start) + np.asarray(x, np.float64)[:, None] * along
+        return 1.0 / np.sqrt(place[:, 1] ** 2 + place[:, 2] ** 2)  # the distance to the eye ray's line
+
+    x = np.linspace(0, length, 400001)
+    exact = np.trapezoid(kernel(x), x)
+    values = np.asarray(inverse, np.float64) * kernel(np.asarray(v))
+    assert values.mean() == pytest.approx(exact, rel=2e-3)
+    assert values.max() < 1.05 * values.min()  # the pdf is that kernel: every sample has the same weight
+
+
+def test_infinite_medium():
+    """The same exact radiance that the virtual points are tested with; no clamping, no compensation."""
+    medium = make_medium(sigma_s=(0.9,) * 3, sigma_a=(0.1,) * 3, half=20.0)
+    scene = lit(medium, position=(0.0, 1.0, 0.0))
+    plan = ims.plan(scene, make_camera(), num_paths=512, lights="rays", jitter=False)
+    lanes = 64
+    rays = (
+        jnp.tile(floats([-3.0, 0.0, 0.0]), (lanes, 1)),
+        jnp.tile(floats([1.0, 0.0, 0.0]), (lanes, 1)),
+        jnp.full(lanes, 6.0),
+        jnp.full(lanes, -1),
+        jnp.arange(lanes, dtype=jnp.uint32),
+    )
+    values = []
+    for k in range(32):
+        context, _ = rendering.make_context(scene, plan, seed=k)
+        found = rendering.gather_rays(context, *rays)
+        values.append(float(jnp.mean(found["volume_from_volume"] + found["volume_from_multiple"])))
+    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    assert error < 0.02 * EXACT
+    assert abs(np.mean(values) - EXACT) < 3.5 * error
+
+
+def test_grids_and_surfaces_are_refused():
+    with pytest.raises(ValueError, match="lights"):
+        ims.plan(lit(make_medium(density=np.ones((4, 4, 4)))), make_camera(), lights="rays")
