@@ -207,20 +207,7 @@ def _to_emitters(
 
 @partial(jax.jit, static_argnames=("num_steps", "num_samples", "num_phase", "directional"))
 def _to_sky(
-    marching,
-    scene,
-    cells,
-    origin,
-    direction,
-    pixel,
-    sample,
-    seed,
-    *,
-    guide=None,
-    num_steps,
-    num_samples,
-    num_phase,
-    directional,
+    marching, scene, cells, origin, direction, pixel, sample, seed, guide, *, num_steps, num_samples, num_phase, directional
 ) -> Connections:
     """Towards a directional light, or in directions drawn from the environment, a new one at each node."""
     nodes, u1, u2 = _sky_nodes(marching, cells, pixel, sample, seed, num_steps, num_samples, _SKY_SET)

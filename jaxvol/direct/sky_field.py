@@ -26,6 +26,7 @@ from jaxvol.direct import patterns
 from jaxvol.types import EnvironmentLight, Medium, Scene
 
 MAX_VERTICES = 2_000_000  # three floats at eight corners each: 200 MB
+_SMALL = 150_000  # vertices that always may be had: they cost a second or two
 _VISIBILITY_POINTS = 12  # along each axis
 _DARK = 1e-30
 
@@ -64,8 +65,12 @@ def occupied(medium: Medium) -> tuple[Float[np.ndarray, "2 3"], tuple[int, int, 
 
 
 def field_shape(voxels: tuple[int, int, int], limit: int = MAX_VERTICES) -> tuple[int, int, int]:
-    """Cells of a field over so many voxels: one each, merged by a whole factor while there are more than `limit`."""
+    """Cells of a field over so many voxels: merged by a whole factor while there are more than `limit`, small grids split."""
     factor = 1
+    while np.prod([n * (factor + 1) + 1 for n in voxels]) <= min(_SMALL, limit):
+        factor += 1
+    if factor > 1:
+        return tuple(n * factor for n in voxels)
     while np.prod([-(-n // factor) + 1 for n in voxels]) > limit:
         factor += 1
     return tuple(-(-n // factor) for n in voxels)
