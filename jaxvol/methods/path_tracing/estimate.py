@@ -1,4 +1,4 @@
-"""Plan, run and turn the film into layers with their variance."""
+"""Plan, and run batches into a film."""
 
 import os
 import threading
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
@@ -15,18 +14,9 @@ from jaxvol import layers as layer_classes
 from jaxvol import lights, media, segments
 from jaxvol.layers import Claim
 from jaxvol.methods.path_tracing import driver, sensors
-from jaxvol.methods.path_tracing.lanes import (
-    EMISSION,
-    FROM_MULTIPLE,
-    FROM_SURFACE,
-    FROM_VOLUME,
-    SURFACE_LIGHT,
-    VOLUME_LIGHT,
-    Settings,
-    num_columns,
-    possible_groups,
-)
-from jaxvol.types import Estimate, Layers, Medium, Rays, Scene
+from jaxvol.methods.path_tracing.film import add_batch, empty_film, to_estimate
+from jaxvol.methods.path_tracing.lanes import Settings, possible_groups
+from jaxvol.types import Estimate, Medium, Rays, Scene
 
 Progress = Callable[[float], None]
 _RANGE = 1 << 18  # pixels traced together
@@ -159,7 +149,7 @@ def add_samples(
     num_lanes: int,
     on_progress: Progress | None = None,
 ) -> None:
-    """Trace `num_samples` more samples of every pixel into `film` [2, P, columns], in ranges that bound the memory.
+    """Trace `num_samples` more samples of every pixel into `film` (`empty_film`), in ranges that bound the memory.
 
     Samples are numbered, so the film does not depend on how they are split, beyond rounding. `on_progress(share)`, which
     one thread at a time calls, may raise to give up; the film is then of no use.
@@ -211,7 +201,7 @@ def add_samples(
                     part.result()  # raises what the part raised
                 (first, count), _, _ = jobs[begin]
                 for part in parts:  # in order, so that a render repeats to the last bit
-                    film[:, first : first + count] += part.result().reshape(2, count, -1)
+                    add_batch(film[first : first + count], part.result(), plan.groups)
                 done[begin : begin + shares] = [1.0] * shares
         finally:
             leaving.set()  # after an error or Ctrl-C the other threads need not finish their shares
@@ -222,12 +212,6 @@ def host_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def empty_film(sensor: sensors.Sensor, plan: Plan) -> np.ndarray:
-    """A film of zeros [2, P, columns]; double precision where that costs little, for sums of very many samples."""
-    total = sensors.num_pixels(sensor)
-    return np.zeros((2, total, num_columns(plan.groups)), np.float64 if total <= _RANGE else np.float32)
-
-
 def lanes_for(items: int, limit: int) -> int:
     """Lanes in powers of four, so that renders of all sizes share a few compilations."""
     lanes = 256
@@ -236,57 +220,12 @@ def lanes_for(items: int, limit: int) -> int:
     return min(lanes, limit)
 
 
-def film_to_layers(
-    film: np.ndarray, groups: tuple[int, ...], num_samples: int, *, only: str | None = None
-) -> tuple[dict, dict]:
-    """Means and variances of the mean of each layer [P, 3] (or of one), with the total under "total"; numpy float32.
-
-    The variance is that of independent samples: (E[x^2] - E[x]^2) / (n - 1); 0 for a single sample.
-    """
-    width = len(groups) + 1
-    column = {group: i for i, group in enumerate(groups)}
-    values = film.reshape(2, film.shape[1], 2, width, 3)
-    sources = {"total": (slice(None), width - 1)}
-    for name, group in (("emission", EMISSION), ("surface_from_light", SURFACE_LIGHT), ("volume_from_light", VOLUME_LIGHT)):
-        if group in column:
-            sources[name] = (slice(None), column[group])
-    for row, kind, present in ((0, "surface", SURFACE_LIGHT in column), (1, "volume", VOLUME_LIGHT in column)):
-        for source, group in (("surface", FROM_SURFACE), ("volume", FROM_VOLUME), ("multiple", FROM_MULTIPLE)):
-            if present and group in column:
-                sources[f"{kind}_from_{source}"] = (slice(row, row + 1), column[group])
-    mean, variance = {}, {}
-    for name, (rows, index) in sources.items():
-        if only not in (None, name):
-            continue
-        average = values[rows, :, 0, index].sum(axis=0, dtype=np.float64) / num_samples
-        square = values[rows, :, 1, index].sum(axis=0, dtype=np.float64) / num_samples
-        mean[name] = average.astype(np.float32)
-        variance[name] = (np.maximum(square - average**2, 0.0) / max(num_samples - 1, 1)).astype(np.float32)
-    return mean, variance
-
-
-def to_estimate(film: np.ndarray, plan: Plan, num_samples: int, shape: tuple[int, ...]) -> Estimate:
-    """All nine layers with their variances from a film of `num_samples` samples a pixel."""
-    mean, variance = film_to_layers(film, plan.groups, num_samples)
-    zeros = np.zeros((film.shape[1], 3), np.float32)
-    full = lambda found: Layers(  # noqa: E731
-        **{name: jnp.asarray(found.pop(name, zeros).reshape(*shape, 3)) for name in layer_classes.NAMES}
-    )
-    spread = full(variance)
-    whole = {"+".join(layer_classes.NAMES): jnp.asarray(variance["total"].reshape(*shape, 3))}
-    return Estimate(
-        mean=full(mean),
-        variance=eqx.tree_at(lambda x: x.sums, spread, whole),  # layers of one path are not independent
-        num_samples=jnp.float32(num_samples),
-    )
-
-
 def _sense(scene, sensor, shape, *, seed, samples, **options):
     decided = plan(scene, sensor, **options)
-    film = empty_film(sensor, decided)
+    film = empty_film(sensors.num_pixels(sensor), decided.groups)
     lanes = lanes_for(sensors.num_pixels(sensor) * samples, decided.num_lanes)
     add_samples(film, scene, sensor, decided, seed=seed, first_sample=0, num_samples=samples, num_lanes=lanes)
-    return to_estimate(film, decided, samples, shape)
+    return to_estimate(film, decided.groups, samples, shape)
 
 
 def radiance(scene: Scene, rays: Rays, *, seed: int = 0, samples: int = 64, **options) -> Estimate:

@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from jaxvol.jobs import Parts, Stop
-from jaxvol.methods.path_tracing.estimate import Plan, add_samples, empty_film, film_to_layers, lanes_for, to_estimate
+from jaxvol.methods.path_tracing.estimate import Plan, add_samples, lanes_for
+from jaxvol.methods.path_tracing.film import TOTAL, empty_film, film_to_layers, to_estimate
 from jaxvol.types import Camera, Estimate, Scene
 
 _BLOCK = 8  # pixels: errors are told over blocks of this size
@@ -48,7 +49,7 @@ def render(
     values out of range.
     """
     _check(samples, seconds, until_error)
-    film, done, batches = empty_film(camera, plan), 0, 0
+    film, done, batches = empty_film(camera.height * camera.width, plan.groups), 0, 0
     if parts is not None and (saved := parts.get("accumulator")) is not None:
         film, done, batches = saved["film"], int(saved["samples"]), int(saved.get("batches", 0))
     resumed = done
@@ -78,11 +79,11 @@ def render(
                 num_lanes=lanes,
                 on_progress=report,
             )
-            if on_progress is not None:  # loops on a device do not report by themselves
-                report(1.0)
         except _GivenUp:
             stopped = True
             break
+        # Loops on a device do not report by themselves; a batch that is complete is not given up.
+        _report(on_progress, None, done, size, target, 1.0)
         if not large:
             film += added
         done, batches = done + size, batches + 1
@@ -104,10 +105,8 @@ def render(
             parts.put("accumulator", {"film": film, "samples": np.int64(done), "batches": np.int64(batches)})
         else:
             parts.clear()
-    estimate = to_estimate(film, plan, done, shape)
-    estimate.diagnostics.update(
-        error=np.float32(block_error(film, plan, done, shape)), resumed_samples=np.int32(resumed), stopped=np.bool_(stopped)
-    )
+    estimate = to_estimate(film, plan.groups, done, shape)
+    estimate.diagnostics.update(error=np.float32(error), resumed_samples=np.int32(resumed), stopped=np.bool_(stopped))
     return estimate
 
 
@@ -165,13 +164,13 @@ def block_error(film: np.ndarray, plan: Plan, num_samples: int, shape: tuple[int
     """
     if num_samples < 2:
         return math.inf
-    mean, variance = film_to_layers(film, plan.groups, num_samples, only="total")
+    mean, variance = film_to_layers(film, plan.groups, num_samples, only=TOTAL)
     height, width = (size - size % _BLOCK if size >= _BLOCK else size for size in shape)
     rows, columns = max(height // _BLOCK, 1), max(width // _BLOCK, 1)
-    cut = variance["total"].reshape(*shape, 3)[:height, :width].astype(np.float64)
+    cut = variance[TOTAL].reshape(*shape, 3)[:height, :width].astype(np.float64)
     pixels = (height // rows) * (width // columns)
     sums = cut.reshape(rows, height // rows, columns, width // columns, 3).sum(axis=(1, 3))
-    average = float(mean["total"].mean(dtype=np.float64))
+    average = float(mean[TOTAL].mean(dtype=np.float64))
     return float(np.sqrt(sums).mean() / pixels / average) if average > 0 else 0.0
 
 

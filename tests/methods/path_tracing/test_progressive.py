@@ -15,6 +15,7 @@ from jaxvol.camera import look_at
 from jaxvol.jobs import Parts, Stop
 from jaxvol.methods import path_tracing
 from jaxvol.methods.path_tracing import estimate, progressive
+from jaxvol.methods.path_tracing.film import empty_film
 from jaxvol.types import Camera, Medium, PointLights, Scene
 
 
@@ -124,7 +125,7 @@ def test_a_resumed_job_remembers_its_batches(fog, tmp_path):
     """What was good enough when it was stopped is good enough at once."""
     scene, camera, plan = fog
     found = path_tracing.render(scene, camera, plan, samples=640)
-    parts, film = Parts(tmp_path / "parts", config={}), estimate.empty_film(camera, plan)
+    parts, film = Parts(tmp_path / "parts", config={}), empty_film(256, plan.groups)
     estimate.add_samples(film, scene, camera, plan, seed=0, first_sample=0, num_samples=640, num_lanes=1024)
     parts.put("accumulator", {"film": film, "samples": np.int64(640), "batches": np.int64(16)})
     goal = 1.1 * float(found.diagnostics["error"])
