@@ -66,7 +66,7 @@ def mitsuba_time(scene, chosen):
 
     mitsuba.set_variant(variant)
     with tempfile.TemporaryDirectory() as folder:
-        described = mitsuba_export.to_mitsuba_dict(scene, view(chosen.size), Path(folder), integrator="volpath")
+        described = mitsuba_export.to_mitsuba_dict(scene, view(chosen.size), Path(folder), integrator="volpath", scale=20.0)
         loaded = mitsuba.load_dict(described)
         integrator = mitsuba.load_dict({"type": "volpath", "max_depth": -1})
         draw = lambda seed: np.array(mitsuba.render(loaded, integrator=integrator, seed=seed, spp=chosen.samples), float)  # noqa: E731

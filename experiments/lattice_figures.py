@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import trimesh
 from lattice_common import HERE, arguments, pictures, timed, volume_image, write_csv
+from PIL import Image
 
 from jaxvol import camera as cameras
 from jaxvol import lights as light_types
@@ -180,12 +181,20 @@ def figure11(size, resolution):
 
 def figure12(size, resolution):
     base = solid("cow")
-    for frame in range(4):
+    for frame in range(8):
         bent = base.copy()
-        bent.vertices[:, 1] += 0.08 * np.sin(6 * base.vertices[:, 2] + 0.5 * math.pi * frame)
+        bent.vertices[:, 1] += 0.08 * np.sin(6 * base.vertices[:, 2] + 0.25 * math.pi * frame)
         medium = body(bent, [30.0, 24.0, 14.0], [0.1, 0.4, 1.0], ior=1.2)
         scene = Scene(medium=medium, spot_lights=spot_light((1.2, 1.2, 1.0)))
         yield f"frame {frame}", shot(scene, camera(size, (1.7, 0.5, 1.6)), resolution)
+
+
+def animation(path, images):
+    """The frames as a looping GIF."""
+    scale = 0.8 / max(np.percentile(np.stack(images), 98), 1e-12)
+    frames = [Image.fromarray(np.uint8(255 * np.clip(i * scale, 0, 1) ** (1 / 2.2))).resize((256, 256)) for i in images]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=120, loop=0)
+    print("wrote", path)
 
 
 FIGURES = {6: figure6, 7: figure7, 8: figure8, 10: figure10, 11: figure11, 12: figure12}
@@ -205,6 +214,8 @@ def main():
             })  # fmt: skip
         write_csv(chosen.out / f"figure{number}.csv", rows)
         pictures(chosen.out / f"figure{number}.png", images, titles)
+        if number == 12:
+            animation(chosen.out / "figure12.gif", images)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Watertight mesh -> occupancy grid.
+"""Watertight mesh -> occupancy grid; any mesh -> the voxels that its surface touches.
 
 Columns of sub-voxels run along z. Where a column's line meets the triangles is found by rasterising every triangle in
 the xy plane, all at once in numpy; between an entry and an exit the column is full, with exact coverage of each voxel
@@ -10,7 +10,7 @@ up. In a column where they do not, only an exit that follows an entry ends an in
 """
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from jaxvol.ray_casting.topology import num_open_edges
 from jaxvol.types import Mesh
@@ -53,6 +53,38 @@ def voxelize(
     triangles[..., :2] -= 0.5 + _SHIFT  # column centres at integers
     column, z, side = _in_turn(*_crossings(triangles, columns))
     return _fill(column, z, side, columns, resolution[2], supersampling)
+
+
+def surface_voxels(
+    mesh: Mesh, bounds: ArrayLike, resolution: tuple[int, int, int]
+) -> tuple[Bool[np.ndarray, "X Y Z"], Float[np.ndarray, "X Y Z 3"]]:
+    """(voxels that hold points of the mesh, mean albedo of the points in each); eager, any mesh.
+
+    Points lie on a triangular lattice of each triangle, at most 0.4 voxels apart: a voxel whose corner alone is cut may
+    be missed, but a ray cannot pass between marked ones without crossing a marked edge or corner.
+    """
+    bounds = np.asarray(bounds, np.float64)
+    scale = np.array(resolution) / (bounds[1] - bounds[0])
+    triangles = (np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)] - bounds[0]) * scale
+    near = np.all((triangles.max(1) >= 0) & (triangles.min(1) <= np.array(resolution)), axis=1)
+    triangles, albedo = triangles[near], np.asarray(mesh.albedo, np.float64)[near]
+    longest = np.max(np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2), axis=1)
+    parts = np.maximum(np.ceil(longest / 0.4).astype(int), 1)
+    num = np.zeros(resolution)
+    total = np.zeros((*resolution, 3))
+    for count in np.unique(parts):
+        i, j = (a.ravel() for a in np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij"))
+        u, v = i[i + j <= count] / count, j[i + j <= count] / count
+        weights = np.stack([1 - u - v, u, v], 1)
+        mine = np.flatnonzero(parts == count)
+        for some in np.array_split(mine, max(1, len(mine) * len(weights) // _MOST_PAIRS + 1)):
+            points = np.einsum("pk,fkc->fpc", weights, triangles[some]).reshape(-1, 3)
+            colour = np.repeat(albedo[some], len(weights), axis=0)
+            inside = np.all((points >= 0) & (points < np.array(resolution)), axis=1)
+            at = tuple(points[inside].astype(np.int64).T)
+            np.add.at(num, at, 1.0)
+            np.add.at(total, at, colour[inside])
+    return num > 0, (total / np.maximum(num, 1.0)[..., None]).astype(np.float32)
 
 
 def _crossings(triangles, columns):

@@ -5,11 +5,11 @@ Interactive Rendering of Scattering and Refraction Effects". Stages, and where t
 `materials` (init, III-A) fills voxels from meshes and grids and smooths the refractive index; `light_rays` (III-A) starts
 rays at the lights; `marching` (III-B) takes them along the eikonal and deposits what is scattered; `lattice`, `sweeps`,
 `solver` (diffusion, III-C) find the steady state, eliminating the directions: a handful of transport sweeps with
-preconditioned conjugate gradients instead of hundreds of lattice steps (`stepping` keeps those, and the 4^3 blocks);
-`view` (III-D) marches eye rays and gathers. Table I's interleaving changes no result, see `stepping`.
+preconditioned conjugate gradients instead of hundreds of lattice steps (`stepping` keeps those, the 4^3 blocks and Table
+I's interleaving); `anisotropy` a Theta that depends on direction; `view` (III-D) marches eye rays and gathers.
 
-It cannot: keep sharp features below a voxel; scatter light back from surfaces into the medium (V S V); resolve
-anisotropy in thin media (similarity: orders are then not split); cast caustics on surfaces outside the medium.
+It cannot: keep sharp features below a voxel; scatter light back from surfaces into the medium (V S V) except from opaque
+meshes inside refractive bodies, as voxels; split orders of anisotropic scattering; cast caustics on surfaces outside.
 """
 
 import equinox as eqx
@@ -22,7 +22,7 @@ from jaxvol.layers import from_items
 from jaxvol.methods.lattice_boltzmann.illumination import Illumination, illuminate
 from jaxvol.methods.lattice_boltzmann.planning import Plan, claims, plan
 from jaxvol.methods.lattice_boltzmann.refraction import radiance_bent
-from jaxvol.methods.lattice_boltzmann.view import fluence_table, gather_straight
+from jaxvol.methods.lattice_boltzmann.view import Source, emission_table, gather_straight
 from jaxvol.types import Camera, Estimate, Layers, Rays, Scene
 
 __all__ = ["Illumination", "Plan", "claims", "illuminate", "plan", "radiance", "render"]
@@ -33,33 +33,40 @@ _ROWS = 1 << 18  # eye rays at a time
 def radiance(scene: Scene, rays: Rays, plan: Plan, light: Illumination, *, seed: int = 0) -> dict[str, np.ndarray]:
     """Layers and sums by name along given rays [n], each [n, 3], from the result of `illuminate`."""
     origin, direction, t_max = (np.array(x, np.float32) for x in (rays.origin, rays.direction, rays.t_max))
-    names, fields = _fields(plan, light)
+    names, sources = _sources(plan, light)
     grid = light.materials.grid
-    table = fluence_table(grid, *fields)
+    table, layout = emission_table(grid, *sources)
     if plan.refract:
-        volume, rest = radiance_bent(scene, plan, light.materials, table, origin, direction, t_max, seed=seed)
+        volume, rest = radiance_bent(scene, plan, light.materials, table, layout, origin, direction, t_max, seed=seed)
     else:
         if scene.mesh is not None:
             t_max = np.minimum(t_max, ray_casting.intersect(ray_casting.caster_for(scene.mesh), origin, direction, t_max)[0])
         volume, _ = gather_straight(
             scene.medium, extinction.marching_medium(scene.medium), segments.medium_casters(scene.medium), grid, table,
-            plan.num_channels, origin, direction, t_max, step=plan.view_step,
+            layout, origin, direction, t_max, step=plan.view_step, degree=plan.degree,
         )  # fmt: skip
         rest = {}
     return {name: volume[:, k] * light.spectrum for k, name in enumerate(names)} | rest
 
 
-def _fields(plan, light):
-    """What is gathered: (layer names, fluence fields)."""
+def _sources(plan, light):
+    """What is gathered: (layer names, their sources)."""
     items = {}
     if plan.split_orders:
-        items["volume_from_light"] = light.from_light
-        items["volume_from_volume"] = light.from_volume
-        items["volume_from_multiple"] = light.scattered - light.from_volume
+        items["volume_from_light"] = Source(light.from_light)
+        items["volume_from_volume"] = Source(light.from_volume)
+        items["volume_from_multiple"] = Source(light.scattered - light.from_volume)
+        from_surface = Source(light.from_surface)
+    elif plan.first_order:
+        name = "volume_from_light+volume_from_volume+volume_from_multiple"
+        items[name] = Source(light.scattered, light.flux, light.from_light, *light.unscattered)
+        if light.from_surface is not None:
+            from_surface = Source(None, None, light.from_surface, *light.surface_unscattered)
     else:
-        items["volume_from_light+volume_from_volume+volume_from_multiple"] = light.from_light + light.scattered
+        items["volume_from_light+volume_from_volume+volume_from_multiple"] = Source(light.from_light + light.scattered)
+        from_surface = Source(light.from_surface)
     if light.from_surface is not None:
-        items["volume_from_surface"] = light.from_surface
+        items["volume_from_surface"] = from_surface
     return list(items), list(items.values())
 
 

@@ -7,15 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxvol.methods.lattice_boltzmann import fine_sweeps, fresnel, light_rays, marching, preconditioner
+from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, fresnel, light_rays, marching, preconditioner
 from jaxvol.methods.lattice_boltzmann import materials as material_pass
-from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice
+from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice, shift
 from jaxvol.methods.lattice_boltzmann.materials import Materials
 from jaxvol.methods.lattice_boltzmann.planning import Plan
 from jaxvol.methods.lattice_boltzmann.refraction import body_entry
 from jaxvol.methods.lattice_boltzmann.solver import solve
 from jaxvol.methods.lattice_boltzmann.sweeps import transport
 from jaxvol.types import Scene
+
+
+class Unscattered(NamedTuple):
+    """Marched light that was scattered not even forwards, for the exact first order (view.py)."""
+
+    track: Float[Array, "C X Y Z"]
+    direction: Float[Array, "3 X Y Z"]  # mean of the directions, shorter than 1 where they differ
 
 
 class Illumination(NamedTuple):
@@ -28,13 +35,20 @@ class Illumination(NamedTuple):
     from_volume: Float[Array, "C X Y Z"]  # scattered once, straight from the lights before
     scattered: Float[Array, "C X Y Z"]  # scattered at all, in the medium
     diagnostics: dict[str, Array]
+    unscattered: Unscattered | None = None  # of from_light; None when scattering is isotropic
+    surface_unscattered: Unscattered | None = None  # of from_surface
+    flux: Float[Array, "C 3 X Y Z"] | None = None  # of scattered, times 3 lambda_1: what the first moment adds to emission
 
 
 def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Illumination:
     """Everything that does not depend on the camera. Diagnostics: books of the marching, applications, residual, converged."""
     report = (lambda name: None) if on_stage is None else on_stage
     grid = material_pass.make_grid(scene.medium, resolution=plan.resolution, margin=plan.margin)
-    materials = material_pass.build(scene.medium, grid, num_channels=plan.num_channels, filter_width=plan.filter_width)
+    materials = material_pass.build(
+        scene.medium, grid, num_channels=plan.num_channels, filter_width=plan.filter_width, degree=plan.degree
+    )
+    if plan.walls:
+        materials = material_pass.with_surfaces(materials, scene.mesh, num_channels=plan.num_channels)
     report("voxelize")
     low = np.asarray(grid.lower, float)
     high = low + float(grid.voxel) * np.array(grid.shape)
@@ -57,17 +71,21 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     whole = track if from_surface is None else track + from_surface
     deposit = materials.scattering * whole
     first = materials.scattering * track
-    wall = None
-    if plan.internal_reflectance > 0:
-        wall = ~(
-            materials.body if materials.body is not None else jnp.any(materials.scattering + materials.absorption > 0, axis=0)
-        )
-    if plan.solve:
+    wall, reflectances = _walls(materials, plan)
+    flux, directional = None, plan.degree > 0
+    if plan.solve and directional:
+        flow = sum(b.flow for b in books)
+        results = [_directional(materials, c, whole, flow, plan) for c in range(plan.num_channels)]
+        scattered, flux, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
+        from_volume = jnp.zeros_like(scattered)  # orders are not split
+    elif plan.solve:
         results = [
-            _channel(materials.scattering[c], materials.absorption[c], deposit[c], first[c], wall, plan)
+            _channel(materials.scattering[c], materials.absorption[c], deposit[c], first[c], wall, reflectances[c], plan)
             for c in range(plan.num_channels)
         ]
         from_volume, scattered, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
+        if materials.solid is not None:  # what walls gather is no fluence; near them the medium's is held
+            from_volume, scattered = (jax.vmap(_fill, (0, None))(x, materials.solid) for x in (from_volume, scattered))
     else:
         from_volume = scattered = jnp.zeros_like(track)
         applications, residual, converged = jnp.zeros(1, jnp.int32), jnp.zeros(1), jnp.ones(1, bool)
@@ -82,7 +100,52 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
         "live": jnp.asarray(sum(b.live for b in books), jnp.float32),
         "num_ray_steps": jnp.asarray(sum(b.num_steps for b in books), jnp.float32),
     }
-    return Illumination(materials, spectrum, track, from_surface, from_volume, scattered, diagnostics)
+    return Illumination(
+        materials, spectrum, track, from_surface, from_volume, scattered, diagnostics,
+        *[b.unscattered for b in books], *[None] * (2 - len(books)), flux,
+    )  # fmt: skip
+
+
+def _walls(materials, plan):
+    """(voxels that reflect diffusely or None, reflectance per channel): the body's surface, and opaque meshes."""
+    num = plan.num_channels
+    wall, reflectances = None, [plan.internal_reflectance] * num
+    if plan.internal_reflectance > 0:
+        filled = materials.body
+        wall = ~(jnp.any(materials.scattering + materials.absorption > 0, axis=0) if filled is None else filled)
+    if materials.solid is not None:
+        reflectances = [jnp.where(materials.solid, materials.solid_albedo[c], reflectances[c]) for c in range(num)]
+        wall = materials.solid if wall is None else wall | materials.solid
+    return wall, reflectances
+
+
+@jax.jit
+def _fill(field, solid):
+    """The mean over the neighbours that are not solid, in solid voxels; 0 where there are none."""
+    weight = jnp.where(solid, 0.0, 1.0)
+    total, count = jnp.zeros_like(field), jnp.zeros_like(field)
+    for c in lattice("26").directions:
+        total, count = total + shift(weight * field, c), count + shift(weight, c)
+    return jnp.where(solid, total / jnp.maximum(count, 1.0), field)
+
+
+def _directional(materials, channel, whole, flow, plan):
+    """(fluence, flux times 3 lambda_1, applications, residual, converged) with a Theta that depends on direction."""
+    found = solve_directional(
+        materials.scattering[channel], materials.absorption[channel], materials.asymmetry, whole, flow, channel, plan=plan
+    )
+    scale = anisotropy.eigenvalues(materials.asymmetry, plan.degree)[1]
+    flux = 3.0**0.5 * scale * found.moments[1:4]  # the moments carry sqrt(3)
+    return found.moments[0], flux, found.num_applications, found.residual, found.converged
+
+
+def _solve_directional(scattering, absorption, g, whole, flow, channel, *, plan):
+    mean = jnp.maximum(jnp.mean(whole, axis=0), 1e-20)
+    sources = anisotropy.first_collisions(scattering, whole[channel], flow * (whole[channel] / mean), g, plan.degree)
+    return anisotropy.solve(
+        lattice(plan.lattice), scattering, absorption, g, sources, degree=plan.degree, kind=plan.probability_map,
+        tolerance=plan.tolerance, max_steps=plan.max_applications,
+    )  # fmt: skip
 
 
 def enter_body(scene: Scene, rays: light_rays.LightRays) -> light_rays.LightRays:
@@ -100,14 +163,36 @@ def enter_body(scene: Scene, rays: light_rays.LightRays) -> light_rays.LightRays
     return light_rays.LightRays(rays.origin[kept], rays.direction[kept], power[kept], rays.t_max[kept])
 
 
-def march(materials: Materials, plan: Plan, rays: light_rays.LightRays, power: np.ndarray, seed: int) -> marching.Marched:
-    """Straight or bent, as planned."""
+class _Light(NamedTuple):
+    """What one set of rays left behind: like `marching.Marched`, with the light that was not scattered at all."""
+
+    track: Float[Array, "C X Y Z"]
+    sent: np.ndarray
+    live: np.ndarray
+    escaped: np.ndarray
+    num_steps: int
+    flow: Float[Array, "3 X Y Z"] | None
+    unscattered: Unscattered | None
+
+
+def march(materials: Materials, plan: Plan, rays: light_rays.LightRays, power: np.ndarray, seed: int) -> _Light:
+    """Straight or bent, as planned; with anisotropic scattering every channel twice, with and without the forward part."""
+    if plan.first_order:
+        materials, power = material_pass.twice(materials, degree=plan.degree), np.concatenate([power, power], axis=1)
     if plan.refract:
-        return marching.march_bent(
+        found = marching.march_bent(
             materials, rays.origin, rays.direction, rays.t_max, power,
-            step=plan.march_step, integrator=plan.integrator, seed=seed,
+            step=plan.march_step, integrator=plan.integrator, seed=seed, with_flow=plan.first_order,
         )  # fmt: skip
-    return marching.march_straight(materials, rays.origin, rays.direction, rays.t_max, power)
+    else:
+        found = marching.march_straight(materials, rays.origin, rays.direction, rays.t_max, power, with_flow=plan.first_order)
+    num = plan.num_channels
+    books = [x[:num] for x in (found.sent, found.live, found.escaped)]
+    if not plan.first_order:
+        return _Light(found.track, *books, found.num_steps, None, None)
+    direction = found.flow / jnp.maximum(jnp.mean(found.track, axis=0), 1e-20)
+    part, whole = found.track[:num], found.track[num:]
+    return _Light(part, *books, found.num_steps, direction * jnp.mean(part, axis=0), Unscattered(whole, direction))
 
 
 def _channels(power, num_channels):
@@ -120,12 +205,12 @@ def _channels(power, num_channels):
     return power.mean(1, keepdims=True), spectrum
 
 
-def _channel(scattering, absorption, deposit, first, wall, plan):
+def _channel(scattering, absorption, deposit, first, wall, reflectance, plan):
     """(fluence of light scattered once, scattered at all, applications, residual, converged) of one channel."""
     if wall is not None:
         deposit, first = (jnp.where(wall, 0.0, x) for x in (deposit, first))
     if not plan.corrections:
-        answer = solve_channel(scattering, absorption, deposit, wall, plan.internal_reflectance, plan.tolerance, plan=plan)
+        answer = solve_channel(scattering, absorption, deposit, wall, reflectance, plan.tolerance, plan=plan)
         from_volume = (
             answer.phi_first if not plan.num_surface_rays else lattice_transport(scattering, absorption, first, wall, plan=plan)
         )
@@ -163,6 +248,7 @@ def _lattice_transport(scattering, absorption, source, wall, *, plan):
     return transport(directions, co, source)
 
 
+solve_directional = jax.jit(_solve_directional, static_argnames="plan")
 solve_channel = jax.jit(_solve_channel, static_argnames="plan")
 lattice_transport = jax.jit(_lattice_transport, static_argnames="plan")
 fine_transport = jax.jit(fine_sweeps.transport, static_argnames="kind")

@@ -11,6 +11,7 @@ voxel scatters scattering * track and absorbs absorption * track, exactly what t
 scattered + absorbed + escaped = sent. Rays are re-packed every `_ROUND` steps, so that dead ones cost nothing.
 """
 
+from collections.abc import Iterator
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -36,6 +37,7 @@ class Marched(NamedTuple):
     live: np.ndarray  # [C]
     escaped: np.ndarray  # [C]
     num_steps: int  # ray steps that were computed
+    flow: Float[Array, "3 X Y Z"] | None = None  # sum over rays of direction times track, mean of the channels; if asked
 
 
 class _Straight(NamedTuple):
@@ -70,7 +72,13 @@ def to_voxels(grid: Grid, origin: np.ndarray, direction: np.ndarray, t_max: np.n
 
 
 def march_straight(
-    materials: Materials, origin: np.ndarray, direction: np.ndarray, t_max: np.ndarray, power: np.ndarray
+    materials: Materials,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    t_max: np.ndarray,
+    power: np.ndarray,
+    *,
+    with_flow: bool = False,
 ) -> Marched:
     """Through the voxels on straight lines; `power` [n, C] at the origin (what lies outside the grid is vacuum)."""
     grid = materials.grid
@@ -78,15 +86,14 @@ def march_straight(
     live = np.flatnonzero(t1 > t0)
     channels = tuple(materials.scattering[c] + materials.absorption[c] for c in range(materials.scattering.shape[0]))
     flat = tuple(x.reshape(-1) for x in channels)
-    track = tuple(jnp.zeros_like(x) for x in flat)
+    track = _dark_track(flat, with_flow)
     books = _Books(power.shape[1])
     for first in range(0, len(live), _BATCH):
         chosen = live[first : first + _BATCH]
         rays = _enter(grid.shape, position[chosen], direction[chosen], t0[chosen], t1[chosen], power[chosen])
         books.sent += power[chosen].sum(0, dtype=np.float64)
-        track = _run(lambda r, k, s=flat, g=grid.shape: _straight_round(s, g, r, k), rays, track, books)
-    shape = (len(flat), *grid.shape)
-    return books.result(jnp.stack(track).reshape(shape))
+        track = _run(lambda r, k: _straight_round(flat, grid.shape, _ROUND, r, k), rays, track, books)
+    return books.result(track, grid.shape)
 
 
 def _enter(shape, position, direction, t0, t1, power):
@@ -106,8 +113,26 @@ def _enter(shape, position, direction, t0, t1, power):
     )  # fmt: skip
 
 
-@partial(jax.jit, static_argnames=("shape",), donate_argnums=(3,))
-def _straight_round(extinction, shape, rays, track):
+def march_straight_by(
+    materials: Materials, origin: np.ndarray, direction: np.ndarray, t_max: np.ndarray, power: np.ndarray, *, num_steps: int
+) -> Iterator[tuple[int, Float[Array, "C X Y Z"]]]:
+    """All rays at once, `num_steps` of their steps at a time (Table I's k): (rays still on their way, track so far)."""
+    grid = materials.grid
+    position, direction, t0, t1 = to_voxels(grid, origin, direction, t_max)
+    live = t1 > t0
+    flat = tuple((s + a).reshape(-1) for s, a in zip(materials.scattering, materials.absorption, strict=True))
+    rays = _enter(grid.shape, position[live], direction[live], t0[live], t1[live], power[live])
+
+    def advance(rays, track):
+        return _straight_round(flat, grid.shape, num_steps, rays, track)
+
+    for count, track in _rounds(advance, rays, _dark_track(flat, False), _Books(power.shape[1]), max_rounds=100_000):
+        # a copy: the next round takes the arrays over
+        yield count, jnp.stack(track).reshape((len(track), *grid.shape))
+
+
+@partial(jax.jit, static_argnames=("shape", "num_steps"), donate_argnums=(4,))
+def _straight_round(extinction, shape, num_steps, rays, track):
     def body(_, carry):
         rays, track = carry
         x, y, z = rays.voxel
@@ -115,7 +140,8 @@ def _straight_round(extinction, shape, rays, track):
         nearest = jnp.minimum(jnp.minimum(rays.t_next[0], rays.t_next[1]), rays.t_next[2])
         stop = jnp.minimum(nearest, rays.t_end)
         length = jnp.maximum(stop - rays.t, 0.0)
-        power, track = _absorb(extinction, track, rays.power, at, length)
+        heading = tuple(s / jnp.maximum(t, 1e-30) for s, t in zip(rays.step, rays.t_step, strict=True))  # 0 of padding
+        power, track = _absorb(extinction, track, rays.power, at, length, heading)
         crossed = nearest < rays.t_end
         moves = [(rays.t_next[a] <= nearest) & crossed for a in range(3)]
         voxel, t_next, outside = [], [], ~crossed
@@ -127,20 +153,29 @@ def _straight_round(extinction, shape, rays, track):
         t = jnp.where(outside, rays.t_end, jnp.maximum(stop, rays.t))
         return rays._replace(voxel=tuple(voxel), t_next=tuple(t_next), t=t, power=power), track
 
-    rays, track = lax.fori_loop(0, _ROUND, body, (rays, track))
+    rays, track = lax.fori_loop(0, num_steps, body, (rays, track))
     return rays, track, rays.t < rays.t_end
 
 
-def _absorb(extinction, track, power, at, length):
-    """One step of attenuation and deposit in every channel; exact for constant extinction."""
-    new_power, new_track = [], []
-    for sigma, field, amount in zip(extinction, track, power, strict=True):
+def _dark_track(extinction, with_flow):
+    """One field per channel, and three for the flow."""
+    return tuple(jnp.zeros_like(extinction[0]) for _ in range(len(extinction) + (3 if with_flow else 0)))
+
+
+def _absorb(extinction, track, power, at, length, heading):
+    """One step of attenuation and deposit in every channel; exact for constant extinction. Fields left over: the flow."""
+    new_power, new_track, total = [], [], 0.0
+    for sigma, field, amount in zip(extinction, track, power, strict=False):
         thickness = sigma[at] * length
         lost = -jnp.expm1(-thickness)
         thin = thickness < 1e-4
         mean = jnp.where(thin, 1.0 - 0.5 * thickness, lost / jnp.where(thin, 1.0, thickness))
-        new_track.append(field.at[at].add(amount * mean * length))
+        deposited = amount * mean * length
+        new_track.append(field.at[at].add(deposited))
         new_power.append(amount - amount * lost)
+        total = total + deposited * (1.0 / len(extinction))
+    for field, component in zip(track[len(extinction) :], heading, strict=False):
+        new_track.append(field.at[at].add(total * component))
     return tuple(new_power), tuple(new_track)
 
 
@@ -151,12 +186,24 @@ class _Books:
         self.sent, self.live, self.escaped = (np.zeros(num_channels) for _ in range(3))
         self.num_steps = 0
 
-    def result(self, track):
-        return Marched(track, self.sent, self.live, self.escaped, self.num_steps)
+    def result(self, track, shape):
+        fields = jnp.stack(track).reshape((len(track), *shape))
+        num = len(self.sent)
+        return Marched(
+            fields[:num], self.sent, self.live, self.escaped, self.num_steps, fields[num:] if len(track) > num else None
+        )
 
 
 def _run(advance, rays, track, books, max_rounds=400):
     """Rounds of steps until no ray is left, packing the living ones between rounds."""
+    found = track
+    for _, found in _rounds(advance, rays, track, books, max_rounds):  # noqa: B007
+        pass
+    return found
+
+
+def _rounds(advance, rays, track, books, max_rounds=400):
+    """(rays still on their way, track so far) after each round."""
     for _ in range(max_rounds):
         count = _bucket(len(rays.power[0]))
         rays = jax.tree.map(lambda x, n=count: _pad(x, n), rays)
@@ -169,11 +216,11 @@ def _run(advance, rays, track, books, max_rounds=400):
         books.escaped += power[~moving].sum(0, dtype=np.float64)
         books.live += power[moving & ~strong].sum(0, dtype=np.float64)
         kept = np.flatnonzero(moving & strong)
+        yield len(kept), track
         if len(kept) == 0:
-            return track
+            return
         rays = jax.tree.map(lambda x, k=kept: np.asarray(x)[k], rays)
     books.live += np.stack([np.asarray(p) for p in rays.power], 1).sum(0, dtype=np.float64)
-    return track
 
 
 def _bucket(count):
@@ -268,6 +315,16 @@ def euler_step(lookup, position, momentum, index, step):
 STEPS = {"leapfrog": leapfrog_step, "smooth": partial(leapfrog_step, project=False), "euler": euler_step}
 
 
+def enters(solid: Bool[Array, "X Y Z"], before: Float[Array, "n 3"], after: Float[Array, "n 3"]) -> Bool[Array, "n"]:
+    """Whether a step ends in a solid voxel and did not begin in one (rays leave the surfaces on which they start)."""
+
+    def at(position):
+        voxel = jnp.clip(position.astype(jnp.int32), 0, jnp.asarray(solid.shape, jnp.int32) - 1)
+        return solid[voxel[:, 0], voxel[:, 1], voxel[:, 2]]
+
+    return at(after) & ~at(before)
+
+
 def bent_table(materials: Materials) -> Float[Array, "voxels 4"]:
     """D and n for `interpolate`."""
     return corner_table(*materials.gradient, materials.ior)
@@ -283,10 +340,11 @@ def march_bent(
     step: float = 0.5,
     integrator: Integrator = "leapfrog",
     seed: int = 0,
+    with_flow: bool = False,
 ) -> Marched:
     """Along bent rays, `step` in voxels; the first step of each ray is shortened at random, so that deposits do not beat.
 
-    Rays that an opaque surface cuts before they enter the grid are ended; opaque surfaces inside the grid are not seen.
+    Rays that an opaque surface cuts before they enter the grid are ended, and those that enter a voxel of `materials.solid`.
     """
     grid = materials.grid
     position, direction, t0, t1 = to_voxels(grid, origin, direction, t_max)
@@ -294,8 +352,9 @@ def march_bent(
     jitter = np.random.default_rng(seed).random(len(t0)) * step
     channels = materials.scattering.shape[0]
     flat = tuple((materials.scattering[c] + materials.absorption[c]).reshape(-1) for c in range(channels))
-    track = tuple(jnp.zeros_like(x) for x in flat)
+    track = _dark_track(flat, with_flow)
     table, books = bent_table(materials), _Books(power.shape[1])
+    solid = materials.solid
     for first in range(0, len(live), _BATCH):
         k = live[first : first + _BATCH]
         amounts = tuple(jnp.asarray(power[k, c], jnp.float32) for c in range(channels))
@@ -303,12 +362,12 @@ def march_bent(
         ones = jnp.ones(len(k), jnp.float32)
         rays = _Bent(jnp.asarray(start, jnp.float32), jnp.asarray(direction[k], jnp.float32), ones, amounts, amounts, ones > 0)
         books.sent += power[k].sum(0, dtype=np.float64)
-        track = _run(lambda r, tr: _bent_round(flat, table, grid.shape, step, integrator, r, tr), rays, track, books)
-    return books.result(jnp.stack(track).reshape((channels, *grid.shape)))
+        track = _run(lambda r, tr: _bent_round(flat, table, grid.shape, step, integrator, solid, r, tr), rays, track, books)
+    return books.result(track, grid.shape)
 
 
-@partial(jax.jit, static_argnames=("shape", "integrator"), donate_argnums=(6,))
-def _bent_round(extinction, table, shape, step, integrator, rays, track):
+@partial(jax.jit, static_argnames=("shape", "integrator"), donate_argnums=(7,))
+def _bent_round(extinction, table, shape, step, integrator, solid, rays, track):
     advance = STEPS[integrator]
     upper = jnp.asarray(shape, jnp.float32)
 
@@ -320,8 +379,12 @@ def _bent_round(extinction, table, shape, step, integrator, rays, track):
         )
         voxel = jnp.clip(middle.astype(jnp.int32), 0, jnp.asarray(shape, jnp.int32) - 1)
         at = (voxel[:, 0] * shape[1] + voxel[:, 1]) * shape[2] + voxel[:, 2]
-        power, track = _absorb(extinction, track, rays.power, at, jnp.where(rays.inside, step, 0.0))
+        size = lax.rsqrt(jnp.maximum(jnp.sum(momentum * momentum, axis=1), 1e-20))
+        heading = tuple(jnp.where(rays.inside, momentum[:, a] * size, 0.0) for a in range(3))
+        power, track = _absorb(extinction, track, rays.power, at, jnp.where(rays.inside, step, 0.0), heading)
         inside = rays.inside & jnp.all((position > 0) & (position < upper), axis=1)
+        if solid is not None:
+            inside = inside & ~enters(solid, rays.position, position)
         keep = rays.inside[:, None]
         return rays._replace(
             position=jnp.where(keep, position, rays.position),

@@ -1,9 +1,11 @@
 """Init pass (section III-A): the medium as numbers per voxel, and the smoothed refractive index with its gradient.
 
 Each voxel holds sigma * h per channel, weighted by how much of it each region fills; later inclusions override earlier
-ones. Anisotropy enters by similarity, sigma_s' = (1 - g) sigma_s. The index is n = 1 + sum of occupancy (n_m - n below),
-filtered once with a Gaussian, then differentiated, so that n and grad n stay consistent (the paper filters the gradient:
-linear, and equal in the interior). Stored is D = grad (n^2 / 2), per voxel length.
+ones. Of anisotropic scattering the forward part f = g^(degree + 1) is left to the ray, sigma_s' = (1 - f) sigma_s:
+similarity at degree 0, delta-M for a lattice that resolves moments up to `degree` (anisotropy.py). The index is
+n = 1 + sum of occupancy (n_m - n below), filtered once with a Gaussian, then differentiated, so that n and grad n stay
+consistent (the paper filters the gradient: linear, and equal in the interior). Stored is D = grad (n^2 / 2), per voxel
+length.
 """
 
 import equinox as eqx
@@ -13,8 +15,8 @@ from jaxtyping import Array, Bool, Float
 from scipy.ndimage import gaussian_filter
 
 from jaxvol import extinction, media
-from jaxvol.types import Medium
-from jaxvol.voxelization import voxelize
+from jaxvol.types import Medium, Mesh
+from jaxvol.voxelization import surface_voxels, voxelize
 
 _SUBSAMPLES = 2  # per voxel edge, of density grids that do not coincide with the lattice
 
@@ -31,11 +33,14 @@ class Materials(eqx.Module):
     """What each voxel does to light, in units of the voxel: sigma * h."""
 
     grid: Grid
-    scattering: Float[Array, "C X Y Z"]  # sigma_s (1 - g) h
+    scattering: Float[Array, "C X Y Z"]  # sigma_s (1 - f) h
     absorption: Float[Array, "C X Y Z"]  # sigma_a h
     ior: Float[Array, "X Y Z"] | None  # smoothed refractive index
     gradient: Float[Array, "3 X Y Z"] | None  # of ior^2 / 2, per voxel
     body: Bool[Array, "X Y Z"] | None  # voxels that some region touches; None exactly when `ior` is
+    asymmetry: Float[Array, "X Y Z"] | None = None  # mean cosine g; None when all is isotropic
+    solid: Bool[Array, "X Y Z"] | None = None  # voxels that hold opaque surfaces; None without such
+    solid_albedo: Float[Array, "C X Y Z"] | None = None  # of these surfaces
 
 
 def regions(medium: Medium) -> tuple[Medium, ...]:
@@ -43,14 +48,15 @@ def regions(medium: Medium) -> tuple[Medium, ...]:
     return (medium, *medium.inclusions)
 
 
-def reduced_sigma(medium: Medium) -> tuple[Float[Array, "R 3"], Float[Array, "R 3"]]:
-    """sigma_s (1 - g) and sigma_a of every region at density 1, per unit length (similarity)."""
+def reduced_sigma(medium: Medium, *, degree: int = 0) -> tuple[Float[Array, "R 3"], Float[Array, "R 3"]]:
+    """sigma_s (1 - g^(degree + 1)) and sigma_a of every region at density 1, per unit length."""
     parts = regions(medium)
-    scattering = jnp.stack([part.sigma_s * (1.0 - _mean_cosine(part)) for part in parts])
+    scattering = jnp.stack([part.sigma_s * (1.0 - mean_cosine(part) ** (degree + 1)) for part in parts])
     return scattering, jnp.stack([part.sigma_a for part in parts])
 
 
-def _mean_cosine(part):
+def mean_cosine(part: Medium) -> Float[Array, ""]:
+    """g of one region."""
     return part.g if part.phase is None else part.phase.moments[1]
 
 
@@ -87,15 +93,18 @@ def make_grid(medium: Medium, *, resolution: int, margin: int = 0) -> Grid:
     return Grid(jnp.asarray(lower, jnp.float32), jnp.float32(voxel), tuple(int(n) for n in count))
 
 
-def build(medium: Medium, grid: Grid, *, num_channels: int, filter_width: float, supersampling: int = 4) -> Materials:
+def build(
+    medium: Medium, grid: Grid, *, num_channels: int, filter_width: float, supersampling: int = 4, degree: int = 0
+) -> Materials:
     """Fill the voxels; eager. `num_channels` 1 takes the first channel of a grey medium."""
     lower, voxel = np.asarray(grid.lower, np.float64), float(grid.voxel)
     bounds = np.array([lower, lower + voxel * np.array(grid.shape)])
-    all_s, all_a = (np.asarray(x)[:, :num_channels] for x in reduced_sigma(medium))
+    all_s, all_a = (np.asarray(x)[:, :num_channels] for x in reduced_sigma(medium, degree=degree))
     scattering = np.zeros((num_channels, *grid.shape), np.float32)
     absorption = np.zeros_like(scattering)
     refractive = any(part.ior is not None for part in regions(medium))
     index, filled = np.ones(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
+    asymmetry = None if media.is_isotropic(medium) else np.zeros(grid.shape, np.float32)
     marching = extinction.marching_medium(medium)
     for number, part in enumerate(regions(medium)):
         share = _share(part, bounds, grid.shape, supersampling)
@@ -103,6 +112,8 @@ def build(medium: Medium, grid: Grid, *, num_channels: int, filter_width: float,
         for channel in range(num_channels):
             for field, sigma in ((scattering, all_s), (absorption, all_a)):
                 field[channel] += share * (sigma[number, channel] * voxel * density - field[channel])
+        if asymmetry is not None:
+            asymmetry = np.where(share > 0.5, np.float32(mean_cosine(part)), asymmetry)
         if refractive:
             own = 1.0 if part.ior is None else _index(part, bounds, grid.shape)
             index += share * (own - index)
@@ -112,7 +123,32 @@ def build(medium: Medium, grid: Grid, *, num_channels: int, filter_width: float,
         index = gaussian_filter(index, filter_width, truncate=3.0, mode="nearest")
         gradient = jnp.asarray(np.stack(np.gradient(0.5 * index * index)))
         ior, body = jnp.asarray(index), jnp.asarray(filled > 0.02)
-    return Materials(grid, jnp.asarray(scattering), jnp.asarray(absorption), ior, gradient, body)
+    asymmetry = None if asymmetry is None else jnp.asarray(asymmetry)
+    return Materials(grid, jnp.asarray(scattering), jnp.asarray(absorption), ior, gradient, body, asymmetry)
+
+
+def with_surfaces(materials: Materials, mesh: Mesh, *, num_channels: int) -> Materials:
+    """Mark the voxels that an opaque mesh touches, with the mean albedo of its faces there; unchanged where it misses."""
+    grid = materials.grid
+    low = np.asarray(grid.lower, np.float64)
+    bounds = np.array([low, low + float(grid.voxel) * np.array(grid.shape)])
+    count, albedo = surface_voxels(mesh, bounds, grid.shape)
+    if not count.any():
+        return materials
+    albedo = np.moveaxis(albedo[..., :num_channels], -1, 0).astype(np.float32)
+    return eqx.tree_at(
+        lambda m: (m.solid, m.solid_albedo), materials, (jnp.asarray(count), jnp.asarray(albedo)), is_leaf=lambda x: x is None
+    )
+
+
+def twice(materials: Materials, *, degree: int) -> Materials:
+    """The channels as they are, and again with the forward part of scattering taken out of the ray (sigma_s whole)."""
+    whole = materials.scattering / (1.0 - materials.asymmetry ** (degree + 1))
+    return eqx.tree_at(
+        lambda m: (m.scattering, m.absorption),
+        materials,
+        (jnp.concatenate([materials.scattering, whole]), jnp.concatenate([materials.absorption] * 2)),
+    )
 
 
 def _share(part, bounds, shape, supersampling):

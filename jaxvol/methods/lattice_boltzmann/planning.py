@@ -42,6 +42,9 @@ class Plan:
     preconditioned: bool
     internal_reflectance: float  # of the body's surface, for the lattice; 0 = open faces
     split_orders: bool  # the first orders as layers of their own
+    degree: int  # of the scattering between links: 0 isotropic or by similarity, else moments up to it (anisotropy.py)
+    first_order: bool  # anisotropic scattering: the exact first order put back
+    walls: bool  # opaque meshes inside the medium as diffuse walls of the lattice
     skipped: tuple[str, ...]  # what was skipped and why; warnings begin with "warning:"
 
 
@@ -51,8 +54,10 @@ def claims(scene: Scene) -> tuple[Claim, ...]:
         return ()
     refract = _refracts(scene)
     surfaces = scene.mesh is not None
-    bent = "reflection at the far side is diffuse and opaque surfaces inside the medium are not seen by light rays"
-    partial = "V S V E, light scattered back by surfaces into the medium, is missed" if surfaces else None
+    bent = "reflection at the far side is diffuse and opaque surfaces inside the medium are voxels"
+    missed = "light reflected by surfaces more than once is missed"
+    through = "V S V E, light scattered back by surfaces into the medium, is missed, and diffuse light passes through them"
+    partial = (missed if refract else through) if surfaces else None
     if refract:
         partial = bent if partial is None else f"{partial}; {bent}"
     one = bent if refract else None
@@ -63,7 +68,7 @@ def claims(scene: Scene) -> tuple[Claim, ...]:
             Claim(("volume_from_multiple",), partial),
         ]
     else:
-        similar = "anisotropy by similarity: right in total only where light scatters often"
+        similar = "light scattered more than once: anisotropy by its first moment, with refraction by similarity"
         found = [Claim(_SUM, similar if partial is None else f"{partial}; {similar}")]
     if not surfaces:
         found.append(Claim(("volume_from_surface",)))  # exactly zero
@@ -104,14 +109,21 @@ def plan(
     corrections: int | None = None,
     preconditioned: bool = True,
     boundary_reflectance: float | None = None,
+    anisotropy: str = "auto",
+    degree: int = 1,
+    walls: bool | None = None,
     specialize: str = "values",
 ) -> Plan:
     """Decide how to render; None and "auto" = chosen from the scene.
 
-    `boundary_reflectance` is how much diffuse light the body's surface throws back inside: None = by its index (0 at 1).
+    `anisotropy`: "similarity", "first_order" (similarity with the exact first order put back, after Nakajima and Tanaka
+    1988) or "directional" (a Theta of moments up to `degree` as well: 26 directions, open faces, no walls); "auto" is the
+    last where it can be. `walls`: opaque meshes as diffuse walls of the lattice; None = with refraction, where light rays
+    end at them too. `boundary_reflectance` is how much diffuse light the body's surface throws back inside: None = by its
+    index (0 at 1).
     Raises ValueError for values out of range and for a closed white box without absorption, which has no steady state.
     """
-    _check(scene, lattice, probability_map, integrator, specialize, boundary_reflectance)
+    _check(scene, lattice, probability_map, integrator, specialize, boundary_reflectance, anisotropy)
     ranges = {
         "resolution": (resolution, 2, 1024),
         "filter_width": (filter_width, 0.75, 8.0),
@@ -123,6 +135,7 @@ def plan(
         "tolerance": (tolerance, 1e-7, 0.1),
         "max_applications": (max_applications, 1, 100_000),
         "corrections": (corrections or 0, 0, 10),
+        "degree": (degree, 1, 3),
     }
     for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
@@ -132,7 +145,20 @@ def plan(
     refract = _refracts(scene) if by_value else any(part.ior is not None for part in regions(scene.medium))
     if not refract:
         skipped.append("index 1: straight rays from voxel to voxel, no gradients")
-    scattering, absorption = (np.asarray(x) for x in reduced_sigma(scene.medium))
+    internal, walls = _closed(scene, refract, boundary_reflectance, walls)
+    closed = internal > 0 or walls
+    isotropic = media.is_isotropic(scene.medium)
+    first_order = not isotropic and anisotropy != "similarity"
+    if anisotropy == "auto":
+        anisotropy = "directional" if lattice == "26" and not closed and not corrections else "first_order"
+    if isotropic or anisotropy != "directional":
+        degree = 0
+    if degree and (closed or lattice != "26"):
+        raise ValueError(
+            f"anisotropy = 'directional' needs lattice = '26', open faces and no walls, but lattice is {lattice!r}, "
+            f"boundary_reflectance {internal:.3g}, walls {walls}"
+        )
+    scattering, absorption = (np.asarray(x) for x in reduced_sigma(scene.medium, degree=degree))
     grey = by_value and media.is_grey(scene.medium) and _one_spectrum(scene)
     if grey:
         skipped.append("one spectrum: one channel is marched and solved")
@@ -153,20 +179,15 @@ def plan(
     solve = not (by_value and float(scattering.max()) == 0.0)
     if not solve:
         skipped.append("nothing scatters: no lattice")
-    internal = boundary_reflectance
-    if internal is None:
-        internal = (
-            fresnel.diffuse_internal(float(np.max(np.asarray(scene.medium.ior))))
-            if refract and scene.medium.ior is not None
-            else 0.0
-        )
     if corrections is None:
-        corrections = 2 if lattice == "26" and internal == 0 else 0
-    if corrections and internal > 0:
-        raise ValueError(f"corrections = {corrections} need open faces, but boundary_reflectance is {internal:.3g}; allowed: 0")
-    isotropic = media.is_isotropic(scene.medium)
+        corrections = 2 if lattice == "26" and not closed and not degree else 0
+    if corrections and (closed or degree):
+        raise ValueError(
+            f"corrections = {corrections} need open faces and isotropic or similar scattering, but boundary_reflectance is "
+            f"{internal:.3g}, walls {walls}, degree {degree}; allowed: 0"
+        )
     if not isotropic:
-        skipped.append("anisotropic scattering by similarity: orders of scattering are not split")
+        skipped.append("anisotropic scattering: orders of scattering are not split")
     return Plan(
         lattice=lattice,
         probability_map=probability_map,
@@ -186,18 +207,31 @@ def plan(
         corrections=corrections,
         solve=solve,
         preconditioned=preconditioned,
-        internal_reflectance=float(internal),
+        internal_reflectance=internal,
         split_orders=isotropic,
+        degree=degree,
+        first_order=first_order,
+        walls=walls,
         skipped=tuple(skipped),
     )
 
 
-def _check(scene, lattice, probability_map, integrator, specialize, boundary_reflectance):
+def _closed(scene, refract, boundary_reflectance, walls):
+    """(reflectance of the body's surface from inside, whether opaque meshes are walls)."""
+    internal = boundary_reflectance
+    if internal is None:
+        bends = refract and scene.medium.ior is not None
+        internal = fresnel.diffuse_internal(float(np.max(np.asarray(scene.medium.ior)))) if bends else 0.0
+    return float(internal), (refract if walls is None else walls) and scene.mesh is not None
+
+
+def _check(scene, lattice, probability_map, integrator, specialize, boundary_reflectance, anisotropy):
     allowed = {
         "lattice": (lattice, tuple(LATTICES)),
         "probability_map": (probability_map, ("auto", "pade", "exp")),
         "integrator": (integrator, ("auto", *STEPS)),
         "specialize": (specialize, ("values", "structure")),
+        "anisotropy": (anisotropy, ("auto", "similarity", "first_order", "directional")),
     }
     for name, (value, choices) in allowed.items():
         if value not in choices:

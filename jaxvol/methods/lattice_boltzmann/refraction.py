@@ -4,7 +4,8 @@ The smoothed index bends but does not reflect, so the entry takes Fresnel's fact
 in, F times what the mirrored ray sees is added. What lies behind is seen along the exit direction.
 """
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,10 +16,9 @@ from jaxvol.methods.lattice_boltzmann.view import gather_bent
 from jaxvol.types import Rays, Scene
 
 
-def radiance_bent(scene: Scene, plan, materials, table, origin, direction, t_max, *, seed=0):
+def radiance_bent(scene: Scene, plan, materials, table, layout, origin, direction, t_max, *, seed=0):
     """(volume radiance [n, L, C], {emission, surface_from_light}) along rays from outside the body."""
-    num_layers = table.shape[1] // plan.num_channels
-    volume = np.zeros((len(origin), num_layers, plan.num_channels), np.float32)
+    volume = np.zeros((len(origin), layout.num_layers, plan.num_channels), np.float32)
     t_entry, normal = body_entry(scene, origin, direction, t_max)
     blocked = np.full(len(origin), np.inf, np.float32)
     if scene.mesh is not None:
@@ -30,8 +30,9 @@ def radiance_bent(scene: Scene, plan, materials, table, origin, direction, t_max
     grid = materials.grid
     start = _entry_points(grid, origin[enters], direction[enters], t_entry[enters], plan.filter_width)
     found, through, exits, heading = gather_bent(
-        materials, table, plan.num_channels, start, direction[enters], step=plan.march_step, integrator=plan.integrator
-    )
+        materials, table, layout, start, direction[enters],
+        step=plan.march_step, integrator=plan.integrator, degree=plan.degree,
+    )  # fmt: skip
     passed = (1.0 - mirror).astype(np.float32)
     volume[enters] = found * passed[:, None, None]
     # camera rays that miss the body, the bent rays behind it, and the mirrored ones at its surface
@@ -46,6 +47,8 @@ def radiance_bent(scene: Scene, plan, materials, table, origin, direction, t_max
     headings = np.concatenate([direction[ahead], heading, mirrored])
     reach = np.concatenate([t_max[ahead], np.full(2 * len(enters), np.inf, np.float32)])
     seen = _background(scene, origins, headings, reach, seed)
+    if materials.solid is not None:
+        _see_inside(scene, materials, seen, slice(len(ahead), len(ahead) + len(enters)), exits, heading, seed)
     spectral = np.broadcast_to(through, (len(enters), 3)) if plan.num_channels == 1 else through
     rest = {}
     for name, value in seen.items():
@@ -58,6 +61,30 @@ def radiance_bent(scene: Scene, plan, materials, table, origin, direction, t_max
             rest["surface_from_light"] = rest.get("surface_from_light", 0.0) + reflected
         rest[name] = rest.get(name, 0.0) + image
     return volume, rest
+
+
+def _see_inside(scene, materials, seen, rows, exits, heading, seed):
+    """Replace what the bent rays see that end at opaque surfaces: lit through the medium, along straight ways to lights."""
+    grid = materials.grid
+    at = np.floor((exits - np.asarray(grid.lower)) / float(grid.voxel)).astype(int)
+    within = np.all((at >= 0) & (at < np.array(grid.shape)), axis=1)
+    at = np.clip(at, 0, np.array(grid.shape) - 1)
+    ended = np.flatnonzero(within & np.asarray(materials.solid)[tuple(at.T)])
+    if len(ended) == 0:
+        return
+    back = (2.0 * float(grid.voxel)) * heading[ended]
+    before = np.floor((exits[ended] - back - np.asarray(grid.lower)) / float(grid.voxel)).astype(int)
+    before = tuple(np.clip(before, 0, np.array(grid.shape) - 1).T)
+    twice = 2.0 * np.asarray(materials.scattering + materials.absorption)[:, before[0], before[1], before[2]].T
+    reach = np.full(len(ended), 6.0 * float(grid.voxel), np.float32)
+    straight = replace(scene, medium=_without_index(scene.medium))
+    found = _background(straight, exits[ended] - back, heading[ended], reach, seed, keep_medium=True)
+    for name, value in found.items():
+        seen[name][rows][ended] = value * np.exp(twice)  # this piece of the way was marched already
+
+
+def _without_index(medium):
+    return replace(medium, ior=None, inclusions=tuple(_without_index(part) for part in medium.inclusions))
 
 
 def body_entry(scene: Scene, origin, direction, t_max):
@@ -91,9 +118,9 @@ def _entry_points(grid, origin, direction, t_entry, filter_width):
     return origin + direction * t[:, None].astype(np.float32)
 
 
-def _background(scene, origin, direction, t_max, seed):
+def _background(scene, origin, direction, t_max, seed, *, keep_medium=False):
     """Surfaces under direct light, emissive surfaces and the environment, without the medium."""
-    empty = eqx.tree_at(lambda s: s.medium, scene, None, is_leaf=lambda x: x is None)
+    empty = scene if keep_medium else replace(scene, medium=None)
     layers = {}
     if scene.mesh is None and scene.environment is None:
         nothing = np.zeros((len(origin), 3), np.float32)

@@ -2,12 +2,19 @@
 
 Emission density is j = sigma_s Phi / (4 pi), Phi the fluence of marched plus lattice light (the lattice's track and phi,
 over h^2). It is taken from fluence, with the sigma of the point and not of the voxel, so that silhouettes are those of
-the mesh. Along straight rays media keep their exact pieces (`segments`). Along bent rays the eikonal is marched as for
-the lights and radiance obeys n^2 d(L / n^2)/ds = -sigma_t L + j (the paper leaves the n^2 out: 2.25 times at n = 1.5).
+the mesh. Where scattering is anisotropic the exact first order is put back, after Nakajima and Tanaka 1988: marched light is
+scattered by sigma_s p about its mean direction in the voxel, instead of by sigma_s' / (4 pi). Where p is the larger, that
+is forwards, only light counts that was not scattered at all: the march of sigma_s' lets pass what is scattered forwards,
+and in their form each such event of one photon is seen anew (a slab of thickness 2 and g .75 then transmits 1.26). A
+lattice that knows directions adds its first moment. Along straight rays media keep their exact pieces (`segments`). Along
+bent rays the eikonal is marched as for the lights and radiance obeys n^2 d(L / n^2)/ds = -sigma_t L + j (the paper leaves
+the n^2 out: 2.25 times at n = 1.5).
 """
 
 import math
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,18 +22,94 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxvol import extinction, segments
-from jaxvol.methods.lattice_boltzmann.marching import STEPS, bent_table, corner_table, interpolate
-from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials, reduced_sigma
+from jaxvol import extinction, phase, segments
+from jaxvol.methods.lattice_boltzmann.anisotropy import eigenvalues, mean_direction
+from jaxvol.methods.lattice_boltzmann.marching import STEPS, bent_table, corner_table, enters, interpolate, to_voxels
+from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials, mean_cosine, reduced_sigma, regions
 from jaxvol.types import Medium
 
 _DARK = 1e-4  # transmittance at which a ray has seen enough
 
 
-def fluence_table(grid: Grid, *fields: Float[Array, "C X Y Z"]) -> Float[Array, "voxels LC"]:
-    """Fluence [W/m2] of each field (layer) and channel, side by side for one row gather; fields hold fluence * h^2."""
+class Layout(NamedTuple):
+    """What the columns of an emission table are; hashable."""
+
+    num_layers: int
+    num_channels: int
+    flux: bool  # first moments of the fluence follow it
+    first: bool  # marched light that is scattered once, and its flow, follow
+
+
+class Source(NamedTuple):
+    """One layer's light that is scattered towards the eye, as fields of fluence * h^2."""
+
+    fluence: Float[Array, "C X Y Z"] | None  # scattered evenly; None = dark
+    flux: Float[Array, "C 3 X Y Z"] | None = None  # its first moment, times 3 lambda_1
+    track: Float[Array, "C X Y Z"] | None = None  # marched light, scattered by the phase function
+    unscattered: Float[Array, "C X Y Z"] | None = None  # what of it was not even scattered forwards
+    direction: Float[Array, "3 X Y Z"] | None = None  # its mean direction, shorter than 1 where directions differ
+
+
+def emission_table(grid: Grid, *sources: Source) -> tuple[Float[Array, "voxels F"], Layout]:
+    """Fluence [W/m2] of each layer and channel, moments and marched light where there are any, side by side for one gather."""
     scale = 1.0 / (grid.voxel * grid.voxel)
-    return corner_table(*[field[c] * scale for field in fields for c in range(field.shape[0])])
+    flux, first = (any(getattr(s, name) is not None for s in sources) for name in ("flux", "track"))
+    some = next(x for s in sources for x in (s.fluence, s.track) if x is not None)
+    dark = jnp.zeros_like(some)
+    columns = [f for s in sources for f in (dark if s.fluence is None else s.fluence)]
+    if flux:
+        for s in sources:
+            moments = jnp.zeros((some.shape[0], 3, *some.shape[1:])) if s.flux is None else s.flux
+            columns += list(moments.reshape(-1, *some.shape[1:]))
+    if first:
+        for name in ("track", "unscattered"):
+            columns += [f for s in sources for f in (dark if s.track is None else getattr(s, name))]
+        for s in sources:
+            flow = jnp.zeros((3, *some.shape[1:])) if s.track is None else s.direction * jnp.mean(s.track, axis=0)
+            columns += list(flow)
+    return corner_table(*[scale * c for c in columns]), Layout(len(sources), some.shape[0], flux, first)
+
+
+def _sources(row, layout, towards):
+    """(fluence [n, L, C], None or marched light: track, unscattered [n, L, C], cosine to `towards`, straightness [n, L])."""
+    n, l, c = row.shape[0], layout.num_layers, layout.num_channels
+    fluence = row[:, : l * c].reshape(n, l, c)
+    at = l * c
+    if layout.flux:
+        moments = row[:, at : at + 3 * l * c].reshape(n, l, c, 3)
+        fluence = jnp.maximum(fluence + jnp.sum(moments * towards[:, None, None, :], axis=-1), 0.0)
+        at += 3 * l * c
+    if not layout.first:
+        return fluence, None
+    track, unscattered = (row[:, k : k + l * c].reshape(n, l, c) for k in (at, at + l * c))
+    flow = row[:, at + 2 * l * c :].reshape(n, l, 3)
+    heading, straightness = mean_direction(jnp.mean(track, axis=-1), tuple(flow[..., a] for a in range(3)))
+    cosine = sum(heading[a] * towards[:, None, a] for a in range(3))
+    return fluence, (track, unscattered, jnp.clip(cosine, -1.0, 1.0), straightness)
+
+
+def _once(first, exact, hard):
+    """Marched light scattered once: by `exact` where the lattice's `hard` phase function is larger, else as said above."""
+    track, unscattered = first[:2]
+    return track * jnp.minimum(exact, hard) + unscattered * jnp.maximum(exact - hard, 0.0)
+
+
+def _truncated(g, cosine, straightness, degree):
+    """4 pi times what the lattice takes for the phase function: sum over l <= degree of (2l + 1) lambda_l P_l, not below 0."""
+    total = jnp.ones_like(cosine)
+    before, legendre, power = jnp.ones_like(cosine), cosine, straightness
+    for l, scale in enumerate(eigenvalues(g, degree)[1:], start=1):
+        total = total + (2 * l + 1) * scale * power * legendre
+        before, legendre = legendre, ((2 * l + 1) * cosine * legendre - l * before) / (l + 1)
+        power = power * straightness
+    return jnp.maximum(total, 0.0)
+
+
+def _spread(part, cosine, straightness):
+    """4 pi p of light whose directions have a mean of length `straightness`: sharpened less by that, exact at 1."""
+    if part.phase is None:
+        return 4.0 * math.pi * phase.henyey_greenstein(cosine, part.g * straightness)
+    return 1.0 + straightness * (4.0 * math.pi * phase.evaluate(part, cosine) - 1.0)
 
 
 def gather_straight(
@@ -34,20 +117,21 @@ def gather_straight(
     marching: extinction.MarchingMedium,
     casters: tuple,
     grid: Grid,
-    table: Float[Array, "voxels LC"],
-    num_channels: int,
+    table: Float[Array, "voxels F"],
+    layout: Layout,
     origin: np.ndarray,
     direction: np.ndarray,
     t_max: np.ndarray,
     *,
     step: float,
+    degree: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(radiance [n, L, C], transmittance [n, C]) along straight rays up to t_max; `step` in voxels at most.
 
-    Rays of like length share a loop of their own number of steps; those that miss the medium cost nothing.
+    Rays of like length share a loop of their own number of steps; what misses the medium, or is empty around it, costs nothing.
     """
-    num_layers = table.shape[1] // num_channels
-    radiance = np.zeros((len(origin), num_layers, num_channels), np.float32)
+    num_channels = layout.num_channels
+    radiance = np.zeros((len(origin), layout.num_layers, num_channels), np.float32)
     through = np.ones((len(origin), num_channels), np.float32)
     if len(origin) == 0:
         return radiance, through
@@ -57,10 +141,17 @@ def gather_straight(
         else segments.segments(medium, origin, direction, t_max, casters=casters)
     )
     t, region = np.asarray(pieces.t), np.asarray(pieces.region)
+    _, _, enter, leave = to_voxels(grid, origin, direction, t_max)  # around the grid the medium is empty
+    enter, leave = (np.float32(float(grid.voxel) * x)[:, None] for x in (enter, leave))
+    t = np.clip(t, enter, np.maximum(enter, leave))
     length = np.where((region >= 0).any(1), t[:, -1] - t[:, 0], 0.0)
     order = np.argsort(length)
     order = order[length[order] > 0]
-    scattering, absorption = (x[:, :num_channels] for x in reduced_sigma(medium))
+    scattering, absorption = (x[:, :num_channels] for x in reduced_sigma(medium, degree=degree))
+    # leaner than the medium: what the loop looks up is `marching`, here only phase functions and sigma_s are read
+    bare = {"density": None, "majorants": None, "ior": None, "boundary": None, "inclusions": ()}
+    parts = tuple(replace(part, **bare) for part in regions(medium))
+    parts = parts if layout.first else None
     num_pieces = max(int(np.max(np.sum(np.diff(t, axis=1) > 0, axis=1))), 1)
     num_pieces = min(1 << (num_pieces - 1).bit_length(), region.shape[1])
     batch = 1 << 15
@@ -71,7 +162,7 @@ def gather_straight(
         steps = int(np.ceil(length[chosen[-1]] / (step * float(grid.voxel))))
         steps = 8 * -(-max(steps, 4) // 8)
         found = _straight(
-            marching, grid, table, scattering, absorption,
+            marching, parts, grid, table, layout, degree, scattering, absorption,
             jnp.asarray(origin[index], jnp.float32), jnp.asarray(direction[index], jnp.float32),
             jnp.asarray(t[index, : num_pieces + 1]), jnp.asarray(region[index, :num_pieces]), steps,
         )  # fmt: skip
@@ -86,11 +177,10 @@ def _bucket(count):
     return size
 
 
-@jax.jit
-def _straight(marching, grid, table, scattering, absorption, origin, direction, t, region, num_steps):
+@partial(jax.jit, static_argnames=("layout", "degree"))
+def _straight(marching, parts, grid, table, layout, degree, scattering, absorption, origin, direction, t, region, num_steps):
     """March n rays; `num_steps` is traced, so that all lengths share one compilation."""
     num_channels = scattering.shape[1]
-    num_layers = table.shape[1] // num_channels
     start = t[:, 0]
     step = (t[:, -1] - start) / num_steps
 
@@ -98,20 +188,26 @@ def _straight(marching, grid, table, scattering, absorption, origin, direction, 
         radiance, through = carry
         low = start + i * step
         points = origin + (low + 0.5 * step)[:, None] * direction
-        fluence = interpolate(table, grid.shape, (points - grid.lower) / grid.voxel)
-        thickness, scattered = 0.0, 0.0
+        row = interpolate(table, grid.shape, (points - grid.lower) / grid.voxel)
+        fluence, first = _sources(row, layout, -direction)
+        thickness, scattered, once = 0.0, 0.0, 0.0
         for number, part in enumerate(marching.regions):
             column = extinction.owned_length(t, region, number, low, low + step)
             if part.density is not None:
                 column = column * extinction.region_density(marching, number, points)
             thickness = thickness + column[:, None] * (scattering[number] + absorption[number])
             scattered = scattered + column[:, None] * scattering[number]
-        fluence = fluence.reshape(-1, num_layers, num_channels)
-        emitted = through * scattered * _mean_through(thickness) / (4.0 * math.pi)
-        return radiance + emitted[:, None, :] * fluence, through * jnp.exp(-thickness)
+            if first is not None:
+                part, angles = parts[number], first[2:]
+                exact = _spread(part, *angles)[..., None] * part.sigma_s[:num_channels]
+                hard = _truncated(mean_cosine(part), *angles, degree)[..., None] * scattering[number]
+                once = once + column[:, None, None] * _once(first, exact, hard)
+        emitted = scattered[:, None, :] * fluence + once
+        seen = (through * _mean_through(thickness) / (4.0 * math.pi))[:, None, :]
+        return radiance + seen * emitted, through * jnp.exp(-thickness)
 
     n = origin.shape[0]
-    begin = (jnp.zeros((n, num_layers, num_channels), jnp.float32), jnp.ones((n, num_channels), jnp.float32))
+    begin = (jnp.zeros((n, layout.num_layers, num_channels), jnp.float32), jnp.ones((n, num_channels), jnp.float32))
     return lax.fori_loop(0, num_steps, body, begin)
 
 
@@ -123,31 +219,30 @@ def _mean_through(thickness):
 
 def gather_bent(
     materials: Materials,
-    table: Float[Array, "voxels LC"],
-    num_channels: int,
+    table: Float[Array, "voxels F"],
+    layout: Layout,
     origin: np.ndarray,
     direction: np.ndarray,
     *,
     step: float,
     integrator: str,
+    degree: int = 0,
     max_rounds: int = 64,
-    solid: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(radiance [n, L, C], transmittance [n, C], exit position, exit direction) along bent rays that start at the grid's faces.
 
-    The camera is outside or in index 1; radiance is L at the start, the factor 1/n^2 inside. `solid` [X, Y, Z] marks
-    voxels of opaque surfaces, where rays end.
+    The camera is outside or in index 1; radiance is L at the start, the factor 1/n^2 inside. Rays end in the voxels of
+    opaque surfaces, `materials.solid`. Anisotropic scattering is Henyey and Greenstein's, of the voxel's mean cosine.
     """
     grid = materials.grid
-    num_layers = table.shape[1] // num_channels
+    num_layers, num_channels = layout.num_layers, layout.num_channels
     n = len(origin)
     radiance = np.zeros((n, num_layers, num_channels), np.float32)
     through = np.ones((n, num_channels), np.float32)
     position = (origin - np.asarray(grid.lower)) / float(grid.voxel)
     heading = np.array(direction, np.float32)
-    kernel_table = jnp.concatenate(
-        [bent_table(materials), corner_table(*materials.scattering, *materials.absorption), table], axis=1
-    )
+    own = [*materials.scattering, *materials.absorption, *([materials.asymmetry] if layout.first else [])]
+    kernel_table = jnp.concatenate([bent_table(materials), corner_table(*own), table], axis=1)
     live = np.arange(n)
     index = np.ones(n, np.float32)
     for _ in range(max_rounds):
@@ -159,8 +254,7 @@ def gather_bent(
             pad = np.concatenate([k, np.full(_bucket(len(k)) - len(k), k[0])])
             state = (position[pad], heading[pad], index[pad], radiance[pad], through[pad])
             state = tuple(jnp.asarray(x, jnp.float32) for x in state)
-            blocked = None if solid is None else jnp.asarray(solid)
-            found = _bent(kernel_table, grid.shape, num_channels, float(grid.voxel), step, integrator, blocked, *state)
+            found = _bent(kernel_table, grid.shape, layout, degree, step, integrator, materials.solid, *state)
             x, p, i, r, t, moving = (np.asarray(v)[: len(k)] for v in found)
             position[k], heading[k], index[k], radiance[k], through[k] = x, p, i, r, t
             batch_end.append(k[moving])
@@ -170,11 +264,12 @@ def gather_bent(
     return radiance, through, end, heading
 
 
-@partial(jax.jit, static_argnames=("shape", "num_channels", "integrator"))
-def _bent(table, shape, num_channels, voxel, step, integrator, solid, position, heading, index, radiance, through):
+@partial(jax.jit, static_argnames=("shape", "layout", "degree", "integrator"))
+def _bent(table, shape, layout, degree, step, integrator, solid, position, heading, index, radiance, through):
     advance = STEPS[integrator]
     upper = jnp.asarray(shape, jnp.float32)
-    c = num_channels
+    c = layout.num_channels
+    columns = 4 + 2 * c + (1 if layout.first else 0)
 
     def body(_, carry):
         position, heading, index, radiance, through, moving = carry
@@ -188,15 +283,21 @@ def _bent(table, shape, num_channels, voxel, step, integrator, solid, position, 
         row = kept["row"]
         thickness = (row[:, 4 : 4 + c] + row[:, 4 + c : 4 + 2 * c]) * step
         scattered = row[:, 4 : 4 + c] * step
-        fluence = row[:, 4 + 2 * c :].reshape(row.shape[0], -1, c)
-        emitted = through * scattered * _mean_through(thickness) / (4.0 * math.pi * (n * n)[:, None])
+        towards = -turned * lax.rsqrt(jnp.maximum(jnp.sum(turned * turned, axis=1, keepdims=True), 1e-20))
+        fluence, first = _sources(row[:, columns:], layout, towards)
+        emitted = scattered[:, None, :] * fluence
+        if first is not None:
+            g = row[:, columns - 1 : columns]
+            exact = 4.0 * math.pi * phase.henyey_greenstein(first[2], g * first[3]) / (1.0 - g ** (degree + 1))
+            hard = _truncated(g, *first[2:], degree)
+            emitted = emitted + scattered[:, None, :] * _once(first, exact[..., None], hard[..., None])
+        seen = through * _mean_through(thickness) / (4.0 * math.pi * (n * n)[:, None])
         on = moving[:, None]
-        radiance = radiance + jnp.where(on, emitted, 0.0)[:, None, :] * fluence
+        radiance = radiance + jnp.where(on, seen, 0.0)[:, None, :] * emitted
         through = jnp.where(on, through * jnp.exp(-thickness), through)
         inside = jnp.all((moved > 0) & (moved < upper), axis=1) & (jnp.max(through, axis=1) > _DARK)
         if solid is not None:
-            at = jnp.clip(moved.astype(jnp.int32), 0, jnp.asarray(shape, jnp.int32) - 1)
-            inside = inside & ~solid[at[:, 0], at[:, 1], at[:, 2]]
+            inside = inside & ~enters(solid, position, moved)
         return (
             jnp.where(on, moved, position), jnp.where(on, turned, heading), jnp.where(moving, n, index),
             radiance, through, moving & inside,
