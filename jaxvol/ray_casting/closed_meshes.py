@@ -25,7 +25,7 @@ import numpy as np
 from jax import lax
 
 _STEP = 2.0**-19  # relative to the coordinates: 16 float32 roundings
-_LEAST_BATCH = 256  # rays on the host
+_LEAST_BATCH = 1024  # rays on the host
 _NEAR_EDGE = 2.0  # steps: nearer to an edge than this, a hit may be one of two
 # Odd directions, and the steps by which rays are moved across them in the first, second and third walk.
 _ASIDE = np.array([[0.0, 0.6, 0.8, 0.0], [0.36, 0.48, 0.8, 16.0], [-0.8, 0.36, 0.48, 23.0]], np.float32)
