@@ -30,6 +30,7 @@ OURS = {  # options, and numbers of light paths
     "full resolution": ({}, (1024, 4096)),
     "full resolution, 8 for the primary light": ({"num_direct": 8}, (2048, 4096)),
     "full resolution, one new vertex": ({"num_chains": 1, "light_stride": 16}, (1024, 4096, 16384)),
+    "virtual ray lights": ({"lights": "rays"}, (512, 2048)),
     "low resolution": ({"upsample": 4, "num_direct": 16}, (1024, 4096, 16384)),
 }
 
@@ -76,7 +77,7 @@ def mitsuba_scene(scene, size):
 @partial(jax.jit, static_argnames="plan")
 def single_scattering(scene, camera, index, seed, *, plan):
     """Light scattered once: Gauss-Legendre quadrature along one jittered eye ray per pixel."""
-    context = rendering.Context(scene, None, None, None, plan, seed)
+    context = rendering.Context(scene, None, None, None, plan, seed, scene.medium)
     xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
     xy, coverage = rendering.choose_in_pixel(scene, camera, xy, index, seed)
     origin, direction, _, _, _ = rendering.cast(context, camera, xy, index)
@@ -161,6 +162,8 @@ def main():
         )
         print(*rows[-1], flush=True)
     for label, (options, numbers) in OURS.items():
+        if "lights" in options and scene.medium.density is not None:
+            continue
         for number in numbers:
             plan = ims.plan(
                 scene,
@@ -191,7 +194,7 @@ def main():
         axes.set_title(f"{arguments.scene}, {arguments.size}^2")
     shape = (arguments.size, arguments.size, 3)
     scale = 0.7 / np.percentile(kept[0], 99)
-    names = ["reference", *OURS]
+    names = ["reference", *dict.fromkeys(r[0] for r in rows[len(SPP) :])]
     pictures(
         folder / f"equal_time_{arguments.scene}_pictures.png",
         [k.reshape(shape) for k in kept],

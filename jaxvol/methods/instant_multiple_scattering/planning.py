@@ -10,7 +10,7 @@ from jaxvol.layers import Claim
 from jaxvol.types import Camera, Scene
 
 _CLAIMED = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in ("surface", "volume", "multiple"))
-_MAP_BYTES = 256e6
+_MAP_BYTES = 300e6
 _PICKS_A_MARCH_IS_WORTH = 20  # lights a group: marching and casting cost about ten kernel evaluations
 
 
@@ -255,7 +255,7 @@ def _columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsam
     """How columns towards lights are found: maps where a light has several times more receivers than texels.
 
     A map costs its texels, a march one in `group_size` of the receivers, both with as many lookups; reading a map costs
-    a tenth of a march (experiments/instant_transmittance.py). Maps of all lights must fit into 256 MB.
+    a tenth of a march (experiments/instant_transmittance.py). Maps of all lights must fit into 300 MB.
     """
     if not tracked:
         return "march"

@@ -29,6 +29,7 @@ from jaxvol.types import Camera, Estimate, Scene
 
 _PIXEL = sampling.stream("instant_multiple_scattering.pixel")
 _STRATA = 4  # of a pixel, each way
+_BAND = 1 << 17  # pixels that are reconstructed at once
 _TERMS = ("surface", "volume", "multiple")
 NAMES = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in _TERMS)
 
@@ -201,27 +202,32 @@ def _from_low_resolution(context, camera, result, counts):
             coarse[name][begin : begin + plan.tile] = np.asarray(values[name])
     steps = max(plan.eye_steps // 2, 1)
     low_guides = upsampling.guides(context.scene, *rays[:4], num_steps=steps)
-    centers, _ = eye_rays(_without_jitter(context), camera, jnp.arange(number, dtype=jnp.uint32))
-    full_guides = upsampling.guides(context.scene, *centers[:4], num_steps=steps)
-    full_guides = _with_mean_source(context, camera, full_guides)
-    built, weight = upsampling.reconstruct(
-        coarse, low_guides, full_guides, height=camera.height, width=camera.width, factor=factor
-    )
-    for name in NAMES:
-        result[name][:] = np.asarray(built[name])
-    seen = np.asarray(jnp.any(full_guides.source > 0, axis=-1) | full_guides.hits)
-    again = np.flatnonzero((np.asarray(weight) < plan.refine_below) & seen).astype(np.uint32)
+    size = min(number, _BAND)
+    refused = []
+    for begin in range(0, number, size):
+        count = min(size, number - begin)
+        pixels = jnp.minimum(jnp.arange(begin, begin + size, dtype=jnp.int32), number - 1)
+        centers, _ = eye_rays(_without_jitter(context), camera, pixels.astype(jnp.uint32))
+        guides = upsampling.guides(context.scene, *centers[:4], num_steps=steps)
+        guides = _with_mean_source(context, camera, guides, pixels.astype(jnp.uint32))
+        options = {"height": camera.height, "width": camera.width, "factor": factor, "pixels": pixels}
+        built, weight = upsampling.reconstruct(coarse, low_guides, guides, **options)
+        for name in NAMES:
+            result[name][begin : begin + count] = np.asarray(built[name])[:count]
+        seen = np.asarray(jnp.any(guides.source > 0, axis=-1) | guides.hits)
+        refused.append(begin + np.flatnonzero(((np.asarray(weight) < plan.refine_below) & seen)[:count]))
+    again = np.concatenate(refused).astype(np.uint32)
     if len(again):
         _evaluate(context, camera, again, result)
     return result, {**counts, "num_refined": len(again), "num_evaluated": len(again) + shape[0]}
 
 
-def _with_mean_source(context, camera, guides):
+def _with_mean_source(context, camera, guides, pixels):
     """The factor that puts transmittance back, averaged over the pixel when pixels are jittered and nothing occludes."""
     if not context.plan.jitter or context.scene.mesh is not None:
         return guides
     steps = max(context.plan.eye_steps // 2, 1)
-    source = _mean_source(context.scene, camera, jnp.arange(guides.end.shape[0], dtype=jnp.uint32), num_steps=steps)
+    source = _mean_source(context.scene, camera, pixels, num_steps=steps)
     return dataclasses.replace(guides, source=source)
 
 

@@ -9,7 +9,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxvol import media, ray_casting
 from jaxvol.methods.instant_multiple_scattering import receivers
@@ -84,9 +84,10 @@ def reconstruct(
     height: int,
     width: int,
     factor: int,
+    pixels: Int[Array, "n"] | None = None,
     spread: float = 0.3,
 ) -> tuple[dict[str, Float[Array, "n 3"]], Float[Array, "n"]]:
-    """Layers at all pixels from the low-resolution ones, and the weight that their neighbours had (0: none fits).
+    """Layers at `pixels` (None: all) from the low-resolution ones, and the weight that their neighbours had (0: none fits).
 
     Weights are bilinear * exp(-|difference of (enter, end)|^2 / (2 spread^2)) * (same kind) * (normals agree).
     """
@@ -95,11 +96,12 @@ def reconstruct(
         name: demodulate(value, low_guides.source if name.startswith("volume") else low_guides.reflectance)
         for name, value in low.items()
     }
-    y = (jnp.arange(height * width) // width + 0.5) / factor - 0.5
-    x = (jnp.arange(height * width) % width + 0.5) / factor - 0.5
+    pixels = jnp.arange(height * width) if pixels is None else pixels
+    y = (pixels // width + 0.5) / factor - 0.5
+    x = (pixels % width + 0.5) / factor - 0.5
     y0, x0 = jnp.floor(y).astype(jnp.int32), jnp.floor(x).astype(jnp.int32)
-    total = jnp.zeros(height * width, jnp.float32)
-    sums = {name: jnp.zeros((height * width, 3), jnp.float32) for name in low}
+    total = jnp.zeros(pixels.shape, jnp.float32)
+    sums = {name: jnp.zeros((*pixels.shape, 3), jnp.float32) for name in low}
     for dy in (0, 1):
         for dx in (0, 1):
             row, column = jnp.clip(y0 + dy, 0, rows - 1), jnp.clip(x0 + dx, 0, columns - 1)
