@@ -1,6 +1,10 @@
 """Table files, configurations, the job, and lookups in both precisions."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import jax
@@ -90,7 +94,7 @@ def test_default_set_is_complete_and_small(default):
 
 
 def test_default_set_is_regenerated(default):
-    """Single scattering and one slice of each multiple-scattering table; `test_default_set_in_full` does the rest."""
+    """Single scattering and one slice of each multiple-scattering table; the test after this does the rest."""
     config = table_config.load(ROOT / "experiments" / "tables" / "default.toml")
     for kind in config.emitters:
         fresh = assemble._chebyshev(assemble.compute_part(f"{kind}-single", config)["values"], (0, 2))
@@ -105,8 +109,26 @@ def test_default_set_is_regenerated(default):
 
 
 @pytest.mark.slow
-def test_default_set_in_full(default):
-    fresh = job.tabulate(table_config.load(ROOT / "experiments" / "tables" / "default.toml"))
+def test_a_killed_command_goes_on_and_regenerates_the_default_set(default, tmp_path):
+    """SIGKILL after some parts; the same command computes the rest, and the file equals the one that is shipped."""
+    out = tmp_path / "tables.npz"
+    command = [sys.executable, "-m", "jaxvol", "tabulate", "experiments/tables/default.toml", "--out", str(out)]
+    parts = job.parts_folder(out)
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while child.poll() is None and len(list(parts.glob("*.npz"))) < 5:
+        time.sleep(0.05)
+    child.kill()
+    assert child.wait() == -signal.SIGKILL, "it ended before it could be killed"
+    assert not out.exists()
+    saved = {path: path.stat().st_mtime_ns for path in parts.glob("*.npz")}
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    kept = saved
+    while child.poll() is None and parts.exists():
+        kept = {path: path.stat().st_mtime_ns for path in saved if path.exists()} or kept
+        time.sleep(0.05)
+    assert child.wait() == 0 and not parts.exists()
+    assert all(saved[path] == when for path, when in kept.items())  # none was computed again
+    fresh = tables.load(out)
     for name, value in fresh.arrays.items():
         np.testing.assert_allclose(default.arrays[name], value, atol=1e-7 * np.abs(value).max(), err_msg=name)
 
