@@ -252,7 +252,9 @@ def test_columns_towards_a_directional_light():
             grid = 1 + np.sin(5 * x) * np.cos(4 * y) * np.sin(3 * z + 1)
             medium = dataclasses.replace(fog(density=grid), bounds=f32([[-1, 0, 2], [1, 1.5, 4]]))
             marching = extinction.marching_medium(medium)
-            found = light_columns.optical_thickness(light_columns.light_columns(marching, f32(way)), medium, points)
+            found = light_columns.optical_thickness(
+                light_columns.light_columns(marching, f32(way), per_voxel=1), medium, points
+            )
             exact = extinction.optical_thickness(
                 medium,
                 points,

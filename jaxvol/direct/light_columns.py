@@ -1,9 +1,9 @@
 """Columns of density towards a directional light, once for all points: prefix sums along the light in a sheared grid.
 
 Points on one line along the light share their coordinates q on the plane where the light enters the box; layers of voxels
-across the light's dominant axis are summed along these lines, at q spaced by a voxel. Unlike sweeps from layer to layer
-nothing is interpolated twice, so columns do not blur with depth. One lookup per sheared voxel to build, one per point to
-use, instead of a march per point. Second order in the voxel.
+across the light's dominant axis are summed along these lines, at q spaced by a voxel (by less in small grids). Unlike
+sweeps from layer to layer nothing is interpolated twice, so columns do not blur with depth. One lookup per sheared voxel
+to build, one per point to use, instead of a march per point. Second order in the spacing.
 """
 
 from functools import partial
@@ -19,6 +19,8 @@ from jaxvol import media
 from jaxvol.extinction import MarchingMedium, region_density
 from jaxvol.types import Medium
 
+_SMALL = 500_000  # cells of the sheared grid that always may be had
+
 
 class LightColumns(eqx.Module):
     """Column of density between points and a directional light."""
@@ -32,12 +34,15 @@ class LightColumns(eqx.Module):
     shape: tuple[int, int, int] = eqx.field(static=True)
 
 
-def light_columns(marching: MarchingMedium, direction: Float[Array, "3"]) -> LightColumns:
-    """Sum densities along the light's travel `direction`; eager. For a medium that is one box with a grid."""
+def light_columns(marching: MarchingMedium, direction: Float[Array, "3"], *, per_voxel: int | None = None) -> LightColumns:
+    """Sum densities along the light's travel `direction`; eager. For a medium that is one box with a grid.
+
+    `per_voxel` lines and layers to a voxel's edge; default one, more in small grids.
+    """
     medium = marching.regions[0]
     low, high = np.asarray(medium.bounds, np.float64)
     way = np.asarray(direction, np.float64)
-    voxels = np.array(medium.density.shape)
+    voxels = (_lines_per_voxel(medium.density.shape) if per_voxel is None else per_voxel) * np.array(medium.density.shape)
     voxel = (high - low) / voxels
     axis = int(np.argmax(np.abs(way) / voxel))
     shear = way / way[axis]
@@ -70,6 +75,14 @@ def light_columns(marching: MarchingMedium, direction: Float[Array, "3"]) -> Lig
         axis=axis,
         shape=tuple(int(c) for c in count),
     )
+
+
+def _lines_per_voxel(shape: tuple[int, int, int]) -> int:
+    """One; more in small grids, where they cost nothing and nothing says that voxels are thin."""
+    factor = 1
+    while factor < 8 and np.prod(shape) * (factor + 1) ** 3 <= _SMALL:
+        factor += 1
+    return factor
 
 
 @partial(jax.jit, static_argnames=("axis", "count"))
