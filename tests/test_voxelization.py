@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 
 from jaxvol.types import Mesh
-from jaxvol.voxelization import _in_turn, open_edges, voxelize
+from jaxvol.voxelization import _in_turn, open_edges, surface_voxels, voxelize
 
 
 def to_mesh(shape):
@@ -132,3 +133,14 @@ def test_pairs_are_worked_off_in_parts(monkeypatch):
     whole = voxelize(to_mesh(torus), padded_bounds(torus), (16, 16, 8))
     monkeypatch.setattr("jaxvol.voxelization._MOST_PAIRS", 100)
     np.testing.assert_allclose(voxelize(to_mesh(torus), padded_bounds(torus), (16, 16, 8)), whole, atol=1e-6)
+
+
+def test_surface_voxels_close_a_sphere_and_carry_its_albedo():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.8)
+    albedo = np.where(ball.triangles_center[:, :1] > 0, 0.8, 0.2) * np.ones(3)
+    mesh = Mesh(jnp.asarray(ball.vertices, jnp.float32), jnp.asarray(ball.faces), jnp.asarray(albedo, jnp.float32))
+    held, colour = surface_voxels(mesh, [[-1, -1, -1], [1, 1, 1]], (20, 20, 20))
+    components, _ = ndimage.label(~held)  # faces join voxels, so that outside and inside must be apart
+    assert components[0, 0, 0] != components[10, 10, 10] and components.max() == 2
+    assert np.allclose(colour[held][:, 0].max(), 0.8) and np.allclose(colour[:9][held[:9]], 0.2)
+    assert not surface_voxels(mesh, [[2, 2, 2], [3, 3, 3]], (4, 4, 4))[0].any()

@@ -136,3 +136,12 @@ def test_linear_map_diverges_where_pade_does_not():
     assert radius(np.full((6, 6), 2.1 / 6) + np.eye(6) * (1 - 2.1)) > 1.05
     assert radius(theta(LATTICES["paper"], 5.9, 0.1)) < 1.0
     assert np.min(theta(LATTICES["paper"], 5.9, 0.1)) < 0 <= np.min(theta(LATTICES["paper"], 5.9, 0.1, kind="exp"))
+
+
+@pytest.mark.parametrize(("x", "ratio"), [(0.1, 0.95), (0.5, 0.75), (1.0, 0.5)])
+def test_linear_map_halves_the_diffusion_constant(x, ratio):
+    """Why sigma h is no probability: D = (h/3)(1/p - 1/2) with p = x against h/(3 x)."""
+    q = 1e-3
+    phases = np.exp(-1j * q * np.array(LATTICES["paper"].directions)[:, 0])
+    slow = max(abs(np.linalg.eigvals(phases[:, None] * (np.full((6, 6), x / 6) + np.eye(6) * (1 - x)))))
+    assert -np.log(slow) / q**2 * 3 * x == pytest.approx(ratio, rel=1e-3)

@@ -1,5 +1,6 @@
 """Marching: bent rays against exact optics (T9), books of straight and bent rays."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +52,30 @@ def test_luneburg_lens_focuses():
 
     assert miss(0.05) < 1e-3 and miss(0.05, "smooth") < 1e-3
     assert miss(0.05, "euler") > 5 * miss(0.05)
+
+
+def test_the_papers_listing_does_not_converge():
+    """Fig. 4 adds grad n / n to v where eq. 3 has grad n: it misses the focus by 8 % however small the step."""
+
+    def listing(lookup, position, momentum, index, step):
+        found = lookup(position)
+        n = found[:, 3:4]
+        gradient = found[:, :3] / n  # of n
+        moved = position + step / n * momentum
+        return moved, momentum + step * gradient / n, found[:, 3], position
+
+    heights = np.linspace(-0.85, 0.85, 8)
+    start = jnp.asarray(np.stack([-np.sqrt(1 - heights**2), heights, 0 * heights], 1), jnp.float32)
+    toward = jnp.broadcast_to(jnp.asarray([1.0, 0, 0]), start.shape)
+
+    def miss(step, integrator):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(marching.STEPS, "listing", listing)
+            index = lambda x: jnp.sqrt(jnp.maximum(2.0 - jnp.sum(x * x), 0.2))  # noqa: E731
+            return _closest(_trace(index, start, toward, step, int(3 / step), integrator)[0], np.array([1.0, 0, 0])).max()
+
+    assert miss(0.025, "listing") > 0.06 and miss(0.0125, "listing") > 0.06
+    assert miss(0.0125, "euler") < 0.02
 
 
 def test_fish_eye_images_every_point_opposite():
@@ -141,6 +166,30 @@ def test_bent_rays_conserve_and_reach_the_same_books_without_bending():
     assert removed + bent.escaped[0] + bent.live[0] == pytest.approx(power.sum(), rel=1e-5)
     coarse = lambda t: np.asarray(t[0]).reshape(4, 2, 4, 2, 4, 2).sum((1, 3, 5))  # noqa: E731
     np.testing.assert_allclose(coarse(bent.track), coarse(straight.track), rtol=0.08)
+
+
+def test_opaque_surfaces_end_bent_rays():
+    """A wall across the grid: nothing behind it, the same as without it before."""
+    shape = (8, 8, 8)
+    free = _materials(shape, 0.1, 0.1, ior=jnp.ones(shape))
+    walled = eqx.tree_at(lambda m: m.solid, free, jnp.zeros(shape, bool).at[:, :, 4].set(True), is_leaf=lambda x: x is None)
+    origin = np.array([[-1 + 0.5 * 3.5, 0.5 * 3.5, 1.0]])
+    rays = (origin, np.array([[0.0, 0, 1]]), np.array([np.inf]), np.array([[1.0]]))
+    tracks = [np.asarray(marching.march_bent(m, *rays, step=0.25).track[0, 3, 3]) for m in (free, walled)]
+    np.testing.assert_allclose(tracks[1][:4], tracks[0][:4], rtol=1e-5)
+    assert np.all(tracks[1][5:] == 0) and np.all(tracks[0][:7] > 0.1)
+
+
+def test_flow_is_direction_times_track():
+    shape = (6, 6, 6)
+    for materials, run in (
+        (_materials(shape, 0.2, 0.1), marching.march_straight),
+        (_materials(shape, 0.2, 0.1, ior=jnp.ones(shape)), marching.march_bent),
+    ):
+        direction = np.array([[0.36, 0.48, 0.8]])
+        origin = np.array([[0.4, 1.4, 3.0]]) - 4 * direction
+        done = run(materials, origin, direction, np.array([np.inf]), np.array([[2.0]]), with_flow=True)
+        np.testing.assert_allclose(done.flow, direction[0][:, None, None, None] * np.asarray(done.track), rtol=1e-3, atol=1e-5)
 
 
 def test_diffuse_internal_reflectance():

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.methods.lattice_boltzmann import preconditioner, stepping
+from jaxvol.methods.lattice_boltzmann import marching, preconditioner, stepping
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES, coefficients
+from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials
 from jaxvol.methods.lattice_boltzmann.solver import solve
 from jaxvol.methods.lattice_boltzmann.sweeps import transport
 
@@ -70,6 +71,30 @@ def test_one_impulse_added_up_is_the_steady_source(medium):
         steady = once(lat, stepping._tables(lat, co, deposit), steady, dark)
         accumulated = accumulated + stepping.phi_of(lat, co, none, impulse)
     np.testing.assert_allclose(accumulated, stepping.phi_of(lat, co, deposit, steady), rtol=2e-5)
+
+
+def test_marching_and_diffusing_in_turn_changes_nothing():
+    """Table I: whatever the length of the ray history buffer, the steady state is that of marching first."""
+    shape = (8, 8, 8)
+    lat = LATTICES["paper"]
+    grid = Grid(jnp.zeros(3), jnp.float32(1.0), shape)
+    scattering, absorption = jnp.full((1, *shape), 0.4), jnp.full((1, *shape), 0.1)
+    materials = Materials(grid, scattering, absorption, None, None, None)
+    rng = np.random.default_rng(0)
+    origin = np.concatenate([rng.random((500, 2)) * 8, np.full((500, 1), -3.0)], axis=1)
+    direction = np.tile([0.28, 0.0, 0.96], (500, 1))
+    rays = (origin, direction, np.full(500, np.inf), np.full((500, 1), 0.002))
+    co = coefficients(lat, scattering[0], absorption[0])
+    track = marching.march_straight(materials, *rays).track
+    apart = jax.jit(stepping.iterate, static_argnums=0, static_argnames="threshold")(
+        lat, co, scattering[0] * track[0], threshold=1e-6
+    )
+    for k in (2, 5):
+        rounds = [(count, scattering[0] * t[0]) for count, t in marching.march_straight_by(materials, *rays, num_steps=k)]
+        assert len(rounds) > 8 // k and rounds[0][0] > 300 and rounds[-1][0] == 0
+        mixed = stepping.interleave(lat, co, [deposit for _, deposit in rounds], threshold=1e-6)
+        assert bool(mixed.converged)
+        np.testing.assert_allclose(mixed.phi, apart.phi, rtol=2e-4)
 
 
 @pytest.mark.parametrize("name", ["paper", "26"])

@@ -1,0 +1,107 @@
+"""Scattering that depends on direction: the Theta of moments, its solve, and the exact first order in the picture."""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+
+from jaxvol import camera as cameras
+from jaxvol import direct
+from jaxvol.methods import lattice_boltzmann
+from jaxvol.methods.lattice_boltzmann import anisotropy, preconditioner
+from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
+from jaxvol.methods.lattice_boltzmann.lattice import LATTICES, coefficients
+from jaxvol.methods.lattice_boltzmann.solver import solve
+from jaxvol.types import Camera, DirectionalLights, Medium, Scene
+
+LATTICE = LATTICES["26"]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_theta_loses_only_what_is_absorbed_and_keeps_the_mean_cosine(degree):
+    scattering, absorption, g = 0.4, 0.1, 0.6
+    matrix = anisotropy.theta(LATTICE, scattering, absorption, g, degree)
+    lengths, weights = LATTICE.lengths, LATTICE.weights
+    x = (scattering + absorption) * lengths
+    beta = 1 / (1 + x / 2)
+    emitted = np.sum(weights * beta)  # what a source's watt sends into the links; the rest stays in the voxel
+    np.testing.assert_allclose(matrix.sum(axis=0), 1 - x * beta + scattering * lengths * beta * emitted, atol=2e-2 * scattering)
+    # Legendre moments of one voxel's phase function between links, lambda_l, by the links' own quadrature
+    unit = np.array(LATTICE.directions) / lengths[:, None]
+    phase = (matrix - np.diag(1 - x * beta)) / np.outer(weights * beta, scattering * lengths * beta)
+    f = g ** (degree + 1)
+    for j in (0, 7, 25):
+        assert np.sum(weights * phase[:, j]) == pytest.approx(1, abs=1e-6)
+        assert np.sum(weights * phase[:, j] * (unit @ unit[j])) == pytest.approx((g - f) / (1 - f), abs=1e-6)
+
+
+def test_without_a_preferred_direction_it_is_the_isotropic_lattice():
+    shape = (7, 8, 9)
+    rng = np.random.default_rng(0)
+    scattering, absorption = jnp.asarray(rng.random(shape), jnp.float32), jnp.full(shape, 0.1)
+    deposit = jnp.asarray(rng.random(shape), jnp.float32)
+    sources = jnp.zeros((4, *shape)).at[0].set(deposit)
+    run = jax.jit(lambda g: anisotropy.solve(LATTICE, scattering, absorption, g, sources, degree=1, tolerance=1e-6))
+    found = run(jnp.zeros(shape))
+    levels = preconditioner.build(shape, scattering + absorption, absorption)
+    exact = jax.jit(
+        lambda: solve(LATTICE, coefficients(LATTICE, scattering, absorption), deposit, tolerance=1e-6, levels=levels)
+    )()
+    assert bool(found.converged)
+    np.testing.assert_allclose(found.moments[0], exact.phi, rtol=1e-4)
+    forward = run(jnp.full(shape, 0.5))
+    assert bool(forward.converged) and float(jnp.max(jnp.abs(forward.moments[0] / exact.phi - 1))) > 0.02
+
+
+def test_first_collisions_of_a_beam_have_the_moments_of_its_direction():
+    direction = np.array([0.48, -0.6, 0.64])
+    track = jnp.full((2, 2, 2), 3.0)
+    flow = jnp.asarray(direction, jnp.float32)[:, None, None, None] * track
+    g = jnp.full((2, 2, 2), 0.5)
+    found = anisotropy.first_collisions(jnp.full((2, 2, 2), 0.2), track, flow, g, 2)
+    f = 0.125
+    scale = [1.0, (0.5 - f) / (1 - f), (0.25 - f) / (1 - f)]
+    expected = [0.6 * scale[l] * y for l, y in zip(anisotropy.orders(2), anisotropy.basis(*direction, 2), strict=True)]
+    np.testing.assert_allclose(found[:, 0, 1, 0], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_biconjugate_gradients_solve_what_is_not_symmetric():
+    rng = np.random.default_rng(1)
+    matrix = jnp.asarray(np.eye(30) + 0.3 * rng.normal(size=(30, 30)) / np.sqrt(30), jnp.float32)
+    right = jnp.asarray(rng.normal(size=30), jnp.float32)
+    answer = lx.linear_solve(lx.MatrixLinearOperator(matrix), right, BiconjugateGradients(tolerance=1e-6, max_steps=60))
+    np.testing.assert_allclose(answer.value, np.linalg.solve(np.asarray(matrix, float), right), rtol=1e-3, atol=1e-4)
+
+
+def _thin(g, sigma_s=0.03):
+    medium = Medium(jnp.asarray([[0.0, 0, 0], [1, 1, 1]]), jnp.full(3, sigma_s), jnp.full(3, 0.01), jnp.float32(g))
+    sun = DirectionalLights(jnp.asarray([[0.0, 0.0, -1.0]]), jnp.ones((1, 3)))
+    return Scene(medium=medium, directional_lights=sun)
+
+
+def _camera(origin, size=6):
+    return Camera(jnp.asarray(cameras.look_at(origin, [0.5, 0.5, 0.5], [0, 1, 0])), jnp.float32(0.3), size, size)
+
+
+@pytest.mark.parametrize("anisotropy", ["first_order", "directional"])
+def test_thin_media_scatter_by_the_exact_phase_function(anisotropy):
+    """Against single scattering by quadrature (`direct`), towards the light and away from it, 10 to 1 apart."""
+    scene = _thin(0.6)
+    for origin in ([0.5, 0.6, 3.0], [0.6, 0.5, -2.0]):
+        camera = _camera(origin)
+        options = {"resolution": 12, "samples_per_pixel": 1, "view_step": 0.5, "anisotropy": anisotropy}
+        found = lattice_boltzmann.render(scene, camera, lattice_boltzmann.plan(scene, camera, **options))
+        (ours,) = (np.asarray(v) for v in found.mean.sums.values())
+        exact = np.asarray(direct.render(scene, camera, direct.plan(scene, camera, samples_per_pixel=4)).mean.volume_from_light)
+        # what is left is light that was scattered twice
+        assert 0.97 * exact.sum() < ours.sum() < 1.06 * exact.sum()
+
+
+def test_plan_refuses_what_directions_cannot_do():
+    scene = _thin(0.5)
+    with pytest.raises(ValueError, match="needs lattice = '26'"):
+        lattice_boltzmann.plan(scene, None, resolution=8, anisotropy="directional", lattice="paper")
+    with pytest.raises(ValueError, match="anisotropy = 'exact' must be one of"):
+        lattice_boltzmann.plan(scene, None, resolution=8, anisotropy="exact")
+    assert lattice_boltzmann.plan(_thin(0.0), None, resolution=8, anisotropy="directional").degree == 0
