@@ -30,7 +30,7 @@ OURS = {  # options, and numbers of light paths
     "full resolution": ({}, (1024, 4096)),
     "full resolution, 8 for the primary light": ({"num_direct": 8}, (2048, 4096)),
     "full resolution, one new vertex": ({"num_chains": 1, "light_stride": 16}, (1024, 4096, 16384)),
-    "virtual ray lights": ({"lights": "rays"}, (512, 2048)),
+    "virtual ray lights": ({"lights": "rays"}, (1024, 2048)),
     "low resolution": ({"upsample": 4, "num_direct": 16}, (1024, 4096, 16384)),
 }
 
@@ -106,7 +106,9 @@ def single_scattering(scene, camera, index, seed, *, plan):
 def ours(scene, camera, plan, seed):
     """The whole picture of one set of lights, and the CPU seconds that it took."""
     start = time.process_time()
-    images, counts = rendering.render_set(scene, camera, plan, seed=seed, sizes=SIZES.setdefault(plan.num_paths, {}))
+    images, counts = rendering.render_set(
+        scene, camera, plan, seed=seed, sizes=SIZES.setdefault((plan.num_paths, plan.lights), {})
+    )
     total = sum(images.values())
     index = jnp.arange(len(total), dtype=jnp.uint32)
     total = total + np.asarray(single_scattering(scene, camera, index, jnp.uint32(seed), plan=plan))

@@ -144,12 +144,13 @@ def fig5(size, samples):
 
 
 def fig6(size, samples):
-    from jaxvol.meshes import load_mesh
+    from jaxvol import meshes
 
     path = Path(__file__).resolve().parents[1] / "../shared/data/meshes/sionna_simple_street_canyon.glb"
     if not path.exists():
         raise SystemExit(f"{path} is absent: this figure needs the shared meshes")
-    mesh = load_mesh(path)
+    plain = {"reflectance": (0.5, 0.5, 0.5), "emission": None, "specular": None, "exponent": None}
+    mesh, _ = meshes.build_mesh([("street", meshes.load(path.name, base=path.parent), plain)])
     vertices = np.asarray(mesh.vertices)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     medium = Medium(

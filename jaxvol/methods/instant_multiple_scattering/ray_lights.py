@@ -50,23 +50,35 @@ class _Row(NamedTuple):
     turn: Float[Array, "*k"]
 
 
-def ray_lights(scene: Scene, vertices: Vertices, *, num_paths: int, seed: int) -> RaySet:
-    """The flights of the paths 0 ... num_paths - 1 that left `vertices`, traced from `seed`."""
+def ray_lights(scene: Scene, vertices: Vertices, *, num_paths: int, seed: int, sizes: dict[str, int] | None = None) -> RaySet:
+    """The flights of the paths 0 ... num_paths - 1 that left `vertices`, traced from `seed`.
+
+    `sizes` are array sizes to keep where they suffice, as in `virtual_lights`.
+    """
     emitted = light_paths.emit(scene, jnp.asarray(light_paths.padded(np.arange(num_paths, dtype=np.uint32))), jnp.uint32(seed))
     first = tuple(np.asarray(x)[:num_paths] for x in (emitted.origin, emitted.direction, emitted.power))
     rows = np.asarray(vertices.valid & vertices.continues)
     later = tuple(np.asarray(x)[rows] for x in (vertices.position, vertices.outgoing, vertices.power))
-    return RaySet(_inside(scene.medium, *first, num_paths), _inside(scene.medium, *later, num_paths))
+    least = [(sizes or {}).get(name, 0) for name in ("volume", "multiple")]
+    found = (_inside(scene.medium, *first, num_paths, least[0]), _inside(scene.medium, *later, num_paths, least[1]))
+    return RaySet(*found)
 
 
-def _inside(medium, origin, direction, power, num_paths):
+def sizes(flights: RaySet) -> dict[str, int]:
+    """Array size of both kinds, for the next call of `ray_lights`."""
+    kinds = {"volume": flights.volume, "multiple": flights.multiple}
+    return {name: x.length.shape[0] for name, x in kinds.items() if x is not None}
+
+
+def _inside(medium, origin, direction, power, num_paths, least):
     t0, t1 = (np.asarray(x) for x in media.box_interval(medium.bounds, jnp.asarray(origin), jnp.asarray(direction)))
     kept = (t1 > t0) & (power.max(axis=-1, initial=0.0) > 0)
     if not np.any(kept):
         return None
     start = origin + t0[:, None] * direction
     strength = power * np.asarray(medium.sigma_s) / num_paths
-    size = capacity(int(kept.sum()))
+    count = int(kept.sum())
+    size = least if count <= least else capacity(count + count // 8)
 
     def pad(values, filler=0.0):
         out = np.full((size, *values.shape[1:]), filler, np.float32)

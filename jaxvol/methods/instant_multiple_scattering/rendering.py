@@ -52,7 +52,7 @@ def make_context(
     if plan.lights == "rays":
         paths = np.arange(plan.num_paths)
         vertices, counts = light_paths.trace(scene, caster, seed=seed, paths=paths, max_depth=plan.max_depth)
-        flights = ray_lights.ray_lights(scene, vertices, num_paths=plan.num_paths, seed=seed)
+        flights = ray_lights.ray_lights(scene, vertices, num_paths=plan.num_paths, seed=seed, sizes=sizes)
         context = Context(scene, caster, LightSet(), None, plan, seed, scene.medium, rays=flights)
         return context, {**counts, "num_lights": len(vertices.path)}
     if lights is None:
@@ -167,7 +167,8 @@ def render_set(
         return result, {"num_truncated": 0, "num_lights": 0}
     context, counts = make_context(scene, plan, seed=seed, lights=lights, sizes=sizes)
     if sizes is not None:
-        sizes.update(virtual_lights.sizes(context.lights))
+        found = virtual_lights.sizes(context.lights) if context.rays is None else ray_lights.sizes(context.rays)
+        sizes.update(found)
     if plan.upsample == 1:
         _evaluate(context, camera, np.arange(number, dtype=np.uint32), result)
         return result, counts
