@@ -313,7 +313,7 @@ def diffusely_lit_slab():
         jnp.asarray(direction, jnp.float32), jnp.asarray(np.repeat((flux / mu)[:, None], 3, 1), jnp.float32)
     )
     scene = Scene(medium=medium, directional_lights=suns)
-    options = {"rays_per_voxel": 0.25, "view_step": 0.25, "corrections": 2}
+    options = {"view_step": 0.25}  # fewer rays than the default sample grazing light too coarsely: 1.5 % of the power lost
     plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), **options)
     light = lattice_boltzmann.illuminate(scene, plan)
     straight = float(np.sum(flux * np.exp(-tau / mu)))
