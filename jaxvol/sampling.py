@@ -47,7 +47,7 @@ def uniforms(seed: ArrayLike, stream: int, index: ArrayLike, dimension: ArrayLik
 
 
 def five_uniforms(
-    seed: ArrayLike, stream: int, index: ArrayLike, dimension: ArrayLike, sample: ArrayLike = 0
+    seed: ArrayLike, stream: int, index: ArrayLike, dimension: ArrayLike, sample: ArrayLike
 ) -> tuple[Float[Array, "*b"], ...]:
     """`uniforms` and a fifth, of 23 bits made of what those four leave unused."""
     mixed = jnp.asarray(seed, jnp.uint32) * jnp.uint32(0x9E3779B9) ^ jnp.uint32(stream)

@@ -260,7 +260,7 @@ def test_spot_intensity_is_linear_in_the_angle():
 def test_the_fifth_uniform_is_uniform_and_independent_of_the_four():
     num = 1 << 16
     index = jnp.arange(num, dtype=jnp.uint32)
-    draws = np.asarray(sampling.five_uniforms(jnp.uint32(5), sampling.stream("test"), index, jnp.uint32(3)))
+    draws = np.asarray(sampling.five_uniforms(jnp.uint32(5), sampling.stream("test"), index, jnp.uint32(3), jnp.uint32(0)))
     np.testing.assert_array_equal(draws[:4], sampling.uniforms(jnp.uint32(5), sampling.stream("test"), index, jnp.uint32(3)))
     assert 0 < draws[4].min() and draws[4].max() < 1
     for other in draws[:4]:

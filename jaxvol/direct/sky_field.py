@@ -64,7 +64,7 @@ def occupied(medium: Medium) -> tuple[Float[np.ndarray, "2 3"], tuple[int, int, 
     return np.stack([low + begin * voxel, low + end * voxel]), tuple(int(n) for n in end - begin)
 
 
-def field_shape(voxels: tuple[int, int, int], limit: int = MAX_VERTICES) -> tuple[int, int, int]:
+def field_shape(voxels: tuple[int, int, int], limit: int) -> tuple[int, int, int]:
     """Cells of a field over so many voxels: merged by a whole factor while there are more than `limit`, small grids split."""
     factor = 1
     while np.prod([n * (factor + 1) + 1 for n in voxels]) <= min(_SMALL, limit):
