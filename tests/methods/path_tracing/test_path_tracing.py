@@ -135,7 +135,7 @@ def test_a_constant_grid_equals_the_homogeneous_medium_in_every_channel():
     for grid in (None, 8):
         medium = box([-1] * 3, [1] * 3, sigma_s=[4.0, 0.04, 0.0], sigma_a=[0.4, 0.004, 1.0], g=0.3, grid=grid)
         scene = Scene(medium=medium, point_lights=point([0.5, 0.3, 0.5]))
-        estimate = path_tracing.radiance(scene, rays, samples=512, seed=3)
+        estimate = path_tracing.radiance(scene, rays, samples=1024, seed=3)
         value, error = total_and_error(estimate)
         found.append((value.mean(axis=0), np.sqrt((error**2).sum(axis=0)) / 256))
     (a, da), (b, db) = found
