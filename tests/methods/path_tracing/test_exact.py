@@ -36,12 +36,12 @@ def source(c):
 @pytest.mark.parametrize(
     ("c", "place", "samples", "power"),
     [
-        (0.5, 0, 4096, POWER),
-        (0.5, 1, 12288, POWER),
-        (0.5, 2, 49152, POWER),
-        (0.9, 0, 12288, POWER),
-        (0.9, 1, 28672, POWER),
-        (0.99, 0, 768, 4e-3),  # a hundred vertices a path: 0.1 % would take ten minutes
+        (0.5, 0, 5120, POWER),
+        (0.5, 1, 16384, POWER),
+        (0.5, 2, 61440, POWER),
+        (0.9, 0, 15360, POWER),
+        (0.9, 1, 49152, POWER),
+        (0.99, 0, 1024, 4e-3),  # a hundred vertices a path: 0.1 % would take ten minutes
     ],
 )
 def test_fluence_around_a_point_source(c, place, samples, power):
@@ -55,7 +55,7 @@ def test_fluence_around_a_point_source(c, place, samples, power):
 def test_radiance_around_a_point_source(direction):
     """T2: rays from r = 1 that do not meet the source; isotropic scattering re-emits the fluence along them."""
     view = rays([[1.0, 0, 0]], [direction], copies=COPIES)
-    value, error = total_and_error(path_tracing.radiance(source(0.5), view, samples=28672), copies=COPIES)
+    value, error = total_and_error(path_tracing.radiance(source(0.5), view, samples=36864), copies=COPIES)
     exact = problems.point_source_radiance([1.0, 0, 0], direction, 0.5)
     assert_equal(value[:, :1], error[:, :1], exact, power=POWER)
 
@@ -73,7 +73,7 @@ def irradiance(scene, z, normal, samples):
 
 def test_half_space_in_collimated_light():
     """T3: plane albedo at mu0 = 1."""
-    found = irradiance(half_space(directional_lights=sun()), 1e-3, -1.0, 4096)
+    found = irradiance(half_space(directional_lights=sun()), 1e-3, -1.0, 5120)
     assert_equal(*found, [problems.HALF_SPACE_PLANE_ALBEDO[:3]], power=POWER)
 
 
@@ -81,18 +81,18 @@ def test_radiance_of_a_half_space():
     """T3: reflected at mu = 1 and 1/2 of light at mu0 = 1."""
     mu = {1.0: problems.HALF_SPACE_H_AT_1, 0.5: problems.HALF_SPACE_H_AT_HALF}
     view = rays([[0, 0, 1.0]] * 2, [[-math.sqrt(1 - m * m), 0, -m] for m in mu], copies=COPIES)
-    estimate = path_tracing.radiance(half_space(directional_lights=sun()), view, samples=4096)
+    estimate = path_tracing.radiance(half_space(directional_lights=sun()), view, samples=5120)
     exact = [[problems.half_space_radiance(m, 1.0, c, mu[m][i], mu[1.0][i]) for i, c in enumerate(ALBEDOS)] for m in mu]
     assert_equal(*total_and_error(estimate, copies=COPIES), exact, power=POWER)
 
 
 def test_half_space_in_diffuse_light():
     """T3: spherical albedo, light of radiance 1 from everywhere above."""
-    found = irradiance(half_space(environment=lights.environment_light([1.0, 1.0, 1.0])), 1e-3, -1.0, 4096)
+    found = irradiance(half_space(environment=lights.environment_light([1.0, 1.0, 1.0])), 1e-3, -1.0, 5120)
     assert_equal(*found, [math.pi * np.array(problems.HALF_SPACE_SPHERICAL_ALBEDO[:3])], power=POWER)
 
 
-SLAB_SAMPLES = ((6144, 1536), (5120, 5120), (5120, 40960), (6144, 5120), (40960, 8192))  # reflected, transmitted
+SLAB_SAMPLES = ((7680, 2048), (6144, 6144), (6144, 51200), (7680, 6144), (51200, 10240))  # reflected, transmitted
 
 
 @pytest.mark.parametrize("side", [0, 1], ids=["reflectance", "transmittance"])
@@ -123,15 +123,15 @@ def test_airlight_of_a_point_light(problem):
     mesh = wall(length) if length == 2.0 else None
     scene = Scene(mesh=mesh, medium=medium, point_lights=light)
     view = rays([[0.0, 0, 0]], [[1.0, 0, 0]], copies=COPIES)
-    estimate = path_tracing.radiance(scene, view, samples=4096, max_scatterings=1)
+    estimate = path_tracing.radiance(scene, view, samples=5120, max_scatterings=1)
     value, error = total_and_error(estimate, copies=COPIES, layer="volume_from_light")
     per_unit = 0.5 * sigma / (4 * math.pi)
     assert_equal(value / per_unit, error / per_unit, exact, power=POWER)
 
 
 T12 = {  # lights, samples of the homogeneous medium and of the grid, options
-    "sun": ({"directional_lights": sun([0.6, -0.8, 0.0])}, 16384, 20480, {}),
-    "point light inside, scattered once": ({"point_lights": point([0.5, 0.3, 0.5])}, 4096, 8192, {"max_scatterings": 1}),
+    "sun": ({"directional_lights": sun([0.6, -0.8, 0.0])}, 20480, 25600, {}),
+    "point light inside, scattered once": ({"point_lights": point([0.5, 0.3, 0.5])}, 5120, 10240, {"max_scatterings": 1}),
 }
 
 

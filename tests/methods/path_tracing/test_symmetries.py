@@ -309,7 +309,7 @@ def test_casting_on_the_device_equals_the_host(kind):
         jnp.concatenate([scene.mesh.albedo, ball.albedo]),
     )
     scene = Scene(mesh=mesh, medium=None if kind == "none" else scene.medium, point_lights=scene.point_lights)
-    found = {caster: path_tracing.radiance(scene, view, samples=64, caster=caster) for caster in ("embree", "bvh")}
+    found = {caster: path_tracing.radiance(scene, view, samples=144, caster=caster) for caster in ("embree", "bvh")}
     pictures = {caster: total_and_error(estimate) for caster, estimate in found.items()}
     assert_same_picture(pictures["embree"], pictures["bvh"])
     for name, image in layers.items(found["bvh"].mean):
