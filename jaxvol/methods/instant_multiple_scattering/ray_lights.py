@@ -6,6 +6,7 @@ equi-angularly on the eye ray: 1/r^2 leaves a finite variance, nothing is clampe
 Homogeneous media without surfaces only.
 """
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -85,7 +86,7 @@ def _inside(medium, origin, direction, power, num_paths, least):
         out[: kept.sum()] = values[kept]
         return jnp.asarray(out)
 
-    return RayLights(pad(start), pad(direction, 3.0**-0.5), pad(t1 - t0, 1e-3), pad(strength))
+    return RayLights(pad(start), pad(direction, 1.0 / math.sqrt(3.0)), pad(t1 - t0, 1e-3), pad(strength))
 
 
 def _asinh(x):

@@ -14,7 +14,26 @@ from jax import lax
 from jaxtyping import Array, Float
 
 
-class ConjugateGradients(lx.AbstractLinearSolver):
+class _Solver(lx.AbstractLinearSolver):
+    """What both solvers tell lineax."""
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
+        return lx.linearise(operator)
+
+    def transpose(self, state, options: dict[str, Any]):
+        flipped = dict(options)
+        if "preconditioner" in options:
+            flipped["preconditioner"] = options["preconditioner"].transpose()
+        return state.transpose(), flipped
+
+    def conj(self, state, options: dict[str, Any]):
+        return lx.conj(state), options
+
+    def assume_full_rank(self):
+        return True
+
+
+class ConjugateGradients(_Solver):
     """Solve A y = b, A symmetric positive definite, b one array, until |b - A y| <= tolerance |b|.
 
     Starts from zero. Options: `preconditioner` (a symmetric positive definite operator). Stats: `num_steps`, `residual`.
@@ -22,9 +41,6 @@ class ConjugateGradients(lx.AbstractLinearSolver):
 
     tolerance: float
     max_steps: int
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
-        return lx.linearise(operator)
 
     def compute(self, state, vector: Float[Array, "..."], options: dict[str, Any]):
         operator = state
@@ -50,20 +66,8 @@ class ConjugateGradients(lx.AbstractLinearSolver):
         y, r, _, _, num_steps = lax.while_loop(unfinished, advance, carry)
         return _answer(y, r, vector, num_steps, self.tolerance)
 
-    def transpose(self, state, options: dict[str, Any]):
-        flipped = dict(options)
-        if "preconditioner" in options:
-            flipped["preconditioner"] = options["preconditioner"].transpose()
-        return state.transpose(), flipped
 
-    def conj(self, state, options: dict[str, Any]):
-        return lx.conj(state), options
-
-    def assume_full_rank(self):
-        return True
-
-
-class BiconjugateGradients(lx.AbstractLinearSolver):
+class BiconjugateGradients(_Solver):
     """Solve A y = b, A any, b one array, until |b - A y| <= tolerance |b|: BiCGStab (van der Vorst 1992), two A a step.
 
     Starts from zero. Options: `preconditioner`, applied from the right. Stats: `num_steps`, `residual`.
@@ -71,9 +75,6 @@ class BiconjugateGradients(lx.AbstractLinearSolver):
 
     tolerance: float
     max_steps: int
-
-    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
-        return lx.linearise(operator)
 
     def compute(self, state, vector: Float[Array, "..."], options: dict[str, Any]):
         operator = state
@@ -103,18 +104,6 @@ class BiconjugateGradients(lx.AbstractLinearSolver):
         carry = (nothing, vector, nothing, nothing, one, one, one, 0)
         y, r, _, _, _, _, _, num_steps = lax.while_loop(unfinished, advance, carry)
         return _answer(y, r, vector, num_steps, self.tolerance)
-
-    def transpose(self, state, options: dict[str, Any]):
-        flipped = dict(options)
-        if "preconditioner" in options:
-            flipped["preconditioner"] = options["preconditioner"].transpose()
-        return state.transpose(), flipped
-
-    def conj(self, state, options: dict[str, Any]):
-        return lx.conj(state), options
-
-    def assume_full_rank(self):
-        return True
 
 
 def _answer(y, r, vector, num_steps, tolerance):

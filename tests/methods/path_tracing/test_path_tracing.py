@@ -6,38 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import layers, lights, media, meshes, phase
+from jaxvol import layers, lights, meshes, phase
 from jaxvol.camera import look_at
 from jaxvol.methods import path_tracing
 from jaxvol.methods.path_tracing import driver
 from jaxvol.types import (
     Camera,
     DirectionalLights,
-    Medium,
     Mesh,
-    PointLights,
     Rays,
     Scene,
 )
-
-
-def box(low, high, *, sigma_s, sigma_a, g=0.0, grid=None, **more):
-    """A medium in a box; `grid` = constant grid of that many voxels along each axis."""
-    density = None if grid is None else np.ones((grid,) * 3, np.float32)
-    rgb = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (3,))  # noqa: E731
-    return Medium(
-        bounds=jnp.asarray([low, high], jnp.float32),
-        sigma_s=rgb(sigma_s),
-        sigma_a=rgb(sigma_a),
-        g=jnp.float32(g),
-        density=None if grid is None else jnp.asarray(density),
-        majorants=None if grid is None else media.majorants(density, block=4),
-        **more,
-    )
-
-
-def point(position, intensity=1.0):
-    return PointLights(jnp.asarray([position], jnp.float32), jnp.full((1, 3), intensity, jnp.float32))
+from tests.methods.path_tracing.builders import box, point
 
 
 def total_and_error(estimate):
