@@ -17,7 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from jaxvol import camera as cameras  # noqa: E402
-from jaxvol import ray_casting, scene, segments  # noqa: E402
+from jaxvol import scene  # noqa: E402
+from jaxvol.common_stages import CommonStages  # noqa: E402
 from jaxvol.image import choose_exposure, tone_map  # noqa: E402
 from jaxvol.methods import deep_screen_space as method  # noqa: E402
 from jaxvol.methods import path_tracing  # noqa: E402
@@ -112,9 +113,7 @@ def layer(problem, camera, *, seed=0, on_stage=None, **options):
 def blocks_with_medium(problem, camera, *, size, num, seed=0):
     """Flat pixel indices [num, size^2] of blocks of pixels, chosen among those whose every ray crosses the medium."""
     plan = method.plan(problem, camera, num_intervals=4, num_steps=64, strides=(1,), num_levels=1)
-    active = map_rays(
-        problem, camera, plan, ray_casting.caster_for(problem.mesh), segments.medium_casters(problem.medium), seed=0
-    )
+    active = map_rays(problem, camera, plan, CommonStages(problem, camera), seed=0)
     shown = np.zeros(camera.height * camera.width, bool)
     shown[active.pixel[: active.num_rays]] = True
     rows, columns = camera.height // size, camera.width // size

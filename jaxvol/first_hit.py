@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxvol import camera as cameras
-from jaxvol import extinction, lights, materials, ray_casting, segments
+from jaxvol import extinction, lights, materials, ray_casting
+from jaxvol.common_stages import CommonStages
 from jaxvol.types import Auxiliary, Camera, Hits, Rays, Scene
 
 _CHUNK = 1 << 16  # rays at a time
@@ -76,16 +77,22 @@ def _center_rays(camera, first, *, count):
     return cameras.generate_rays(camera, xy)
 
 
-def auxiliary(scene: Scene, camera: Camera, *, caster: ray_casting.Caster = None, num_steps: int | None = None) -> Auxiliary:
+def auxiliary(
+    scene: Scene,
+    camera: Camera,
+    *,
+    caster: ray_casting.Caster = None,
+    num_steps: int | None = None,
+    common: CommonStages | None = None,
+) -> Auxiliary:
     """Depth, transmittance, albedo (Lambert plus Phong) and normal of the first surface through each pixel's centre.
 
     Depth is inf where there is no surface; transmittance goes on to infinity there. Fields that the scene cannot have
-    (no mesh, no medium) are None. `num_steps` defaults to one a voxel.
+    (no mesh, no medium) are None. `num_steps` defaults to one a voxel. The first hits are those of `common`, unless a `caster`
+    is given.
     """
-    caster = ray_casting.caster_for(scene.mesh) if caster is None else caster
+    common = CommonStages(scene, camera) if common is None else common
     medium = scene.medium
-    casters = segments.medium_casters(medium)
-    marching = None if medium is None else extinction.marching_medium(medium)
     if num_steps is None:
         num_steps = 0 if medium is None else max(1, extinction.num_voxels_across(medium))
     total = camera.height * camera.width
@@ -93,13 +100,19 @@ def auxiliary(scene: Scene, camera: Camera, *, caster: ray_casting.Caster = None
     parts = {"depth": [], "transmittance": [], "albedo": [], "normal": []}
     for first in range(0, total, count):
         rays = _center_rays(camera, jnp.int32(first), count=count)
-        hits = first_hits(scene, rays, caster)
+        if caster is None:
+            part = np.minimum(np.arange(first, first + count), total - 1)
+            hits = _hits(scene.mesh, rays.origin, rays.direction, *(x[part] for x in common.center_hits))
+        else:
+            hits = first_hits(scene, rays, caster)
         values = {}
         if scene.mesh is not None:
             values["depth"] = jnp.where(hits.valid, hits.t, jnp.inf)
             values["albedo"], values["normal"] = _guides(scene.mesh, hits, rays.direction)
         if medium is not None:
-            values["transmittance"] = transmittance(scene, rays, hits, casters=casters, num_steps=num_steps, marching=marching)
+            values["transmittance"] = transmittance(
+                scene, rays, hits, casters=common.medium_casters, num_steps=num_steps, marching=common.marching
+            )
         for name, value in values.items():
             parts[name].append(np.asarray(value)[: total - first])
 

@@ -1,10 +1,15 @@
-"""Run one method on a loaded scene and keep the books: keyword arguments, stages, plan, compile and run times.
+"""Run one method, or several for one picture, and keep the books: keyword arguments, stages, plan, compile and run times.
 
 A method is a module with `claims(scene)`, `plan(scene, camera, *, ...)` and `render(scene, camera, plan, *, seed, ...)`.
 Which keyword arguments it takes is read off `plan` and `render`. Two of them are offered to every method that names them:
 `on_progress(share)` is called as work gets done, `on_stage(name)` after each stage, for the table of stage times.
+
+A composite (`jaxvol.composite`) runs each of its methods once. What they share is handed to every method whose `render`
+names `common`; a plan's fields `emission`, `surface` and `volume`, where it has them, are switched off for layers that
+nobody asks of it.
 """
 
+import dataclasses
 import importlib
 import inspect
 import platform
@@ -22,6 +27,9 @@ import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 import jaxvol
+from jaxvol import composite
+from jaxvol.common_stages import CommonStages
+from jaxvol.composite import Share
 from jaxvol.jobs import Parts, Stop
 from jaxvol.layers import NAMES, SURFACE, VOLUME, Claim, total
 from jaxvol.scene import SceneFile
@@ -32,6 +40,7 @@ OFFERED = (
     "seed",
     "on_progress",
     "on_stage",
+    "common",
     "parts",
     "stop",
     "seconds",
@@ -53,6 +62,8 @@ class Rendering:
     skipped: tuple[str, ...]
     seconds: dict[str, float]  # plan, compile, run
     stages: dict[str, float] = field(default_factory=dict)  # compile time included where a stage compiled
+    shares: tuple[Share, ...] = ()  # of a composite: who computed what, and why
+    missing: tuple[str, ...] = ()  # layers that nobody computed though the scene may contain them
 
     @property
     def nonfinite_pixels(self) -> int:
@@ -136,19 +147,100 @@ def _job_arguments(job: Job | None, name: str, module: ModuleType, file: SceneFi
 def render_scene(
     file: SceneFile, *, method: str | None = None, on_progress: Progress | None = None, job: Job | None = None
 ) -> Rendering:
-    """Plan and render the scene with one method, timed. Raises ValueError for what the method refuses."""
+    """Plan and render the scene, timed: with `method` alone, else as the file says, by [render.layers] or its method.
+
+    "auto" chooses a method for each layer. Raises ValueError for what a method or the composite refuses.
+    """
     name = file.render.method if method is None else method
     if file.camera is None:
         raise ValueError("camera is missing: a picture needs a [camera] table")
-    if name == "auto" or file.render.layers:
-        raise ValueError("render.layers and method 'auto' (composites of methods) are not supported yet; name one method")
+    if name == "auto" or (method is None and file.render.layers):
+        return _render_composite(file, on_progress=on_progress, job=job, chosen=name == "auto" and not file.render.layers)
+    result = _run(file, name, on_progress=on_progress, job=job)
+    held = {layer for claim in result.claims for layer in claim.layers}
+    missing = tuple(layer for layer in composite.possible(file.scene) if layer not in held)
+    return dataclasses.replace(result, missing=missing)
+
+
+def _render_composite(file: SceneFile, *, on_progress: Progress | None, job: Job | None, chosen: bool) -> Rendering:
+    """Every method of the assignment once, and the sum."""
+    if job is not None and job.goal:
+        key = "--time" if "seconds" in job.goal else "--until-error"
+        raise ValueError(f"{key}: a composite does not refine; name one method (path_tracing does)")
+    start = time.perf_counter()
+    assigned = assign(file, automatic=chosen)
+    parts, seconds = [], {"plan": time.perf_counter() - start, "compile": 0.0, "run": 0.0}
+    common = CommonStages(file.scene, file.camera)
+    for index, share in enumerate(assigned.shares):
+        report = None
+        if on_progress is not None:
+
+            def report(done: float, note: str = "", index: int = index, name: str = share.method) -> None:
+                on_progress((index + min(done, 1.0)) / len(assigned.shares), f"{name} {note}".strip())
+
+        parts.append(_run(file, share.method, on_progress=report, job=job, share=share, common=common))
+        if report is not None:
+            report(1.0)
+    for part in parts:
+        seconds = {key: value + part.seconds[key] for key, value in seconds.items()}
+    pairs = [(share, part.estimate) for share, part in zip(assigned.shares, parts, strict=True)]
+    return Rendering(
+        estimate=composite.compose(pairs),
+        method="+".join(part.method for part in parts),
+        arguments={part.method: part.arguments for part in parts},
+        claims=tuple(claim for share in assigned.shares for claim in share.claims),
+        skipped=tuple(f"{part.method}: {line}" for part in parts for line in part.skipped),
+        seconds=seconds,
+        stages={f"{part.method}: {stage}": value for part in parts for stage, value in part.stages.items()},
+        shares=assigned.shares,
+        missing=assigned.missing,
+    )
+
+
+def assign(file: SceneFile, *, automatic: bool = False) -> composite.Assignment:
+    """Who computes which layer of a scene file: its [render.layers], or by what the scene is. Raises ValueError."""
+
+    def claims_of(name: str) -> tuple[Claim, ...]:
+        return tuple(load_method(name).claims(file.scene))
+
+    allow = file.render.allow_partial
+    if automatic or not file.render.layers:
+        assigned = composite.choose(file.scene, claims_of, allow_partial=allow)
+    else:
+        assigned = composite.from_table(file.render.layers, file.scene, claims_of, allow_partial=allow)
+    if not assigned.shares:
+        raise ValueError("no layer is computed: the scene has no light, or nothing that a camera could see by it")
+    return assigned
+
+
+def restricted(plan: Any, layers: tuple[str, ...]) -> Any:
+    """The plan without the kinds of receiver that none of `layers` has, where it has switches for them."""
+    kinds = ("emission", "surface", "volume")
+    held = {f.name for f in dataclasses.fields(plan)} if dataclasses.is_dataclass(plan) else set()
+    wanted = {kind: any(layer.split("_")[0] == kind for layer in layers) for kind in kinds}
+    off = {kind: False for kind in kinds if kind in held and not wanted[kind] and getattr(plan, kind) is True}
+    return dataclasses.replace(plan, **off) if off else plan
+
+
+def _run(
+    file: SceneFile,
+    name: str,
+    *,
+    on_progress: Progress | None,
+    job: Job | None,
+    share: Share | None = None,
+    common: CommonStages | None = None,
+) -> Rendering:
+    """One method: all that it claims, or its share of a composite."""
     module = load_method(name)
     plan_arguments, render_arguments = method_arguments(module, name, file)
     stages: dict[str, float] = {}
     with compile_seconds() as compiling:
         start = time.perf_counter()
-        claims = tuple(module.claims(file.scene))
+        claims = tuple(module.claims(file.scene)) if share is None else share.claims
         plan = module.plan(file.scene, file.camera, **plan_arguments)
+        if share is not None:
+            plan = restricted(plan, share.layers)
         planned, last = time.perf_counter(), [time.perf_counter()]
         compiled_in_plan = compiling[0]
 
@@ -157,7 +249,7 @@ def render_scene(
             stages[stage] = stages.get(stage, 0.0) + now - last[0]
             last[0] = now
 
-        offered = {"seed": file.render.seed, "on_progress": on_progress, "on_stage": on_stage}
+        offered = {"seed": file.render.seed, "on_progress": on_progress, "on_stage": on_stage, "common": common}
         taken = inspect.signature(module.render).parameters
         offered = {key: value for key, value in offered.items() if key in taken and value is not None}
         offered |= _job_arguments(job, name, module, file, plan)

@@ -10,15 +10,20 @@ import numpy as np
 import typer
 
 import jaxvol
-from jaxvol import image, jobs, rendering
-from jaxvol.layers import items, total
+from jaxvol import image, jobs, picture_sheets, rendering
+from jaxvol.layers import NAMES, items, total
 from jaxvol.scene import SceneFile, load_scene
 
 
 def render(
     scene: Annotated[Path, typer.Argument(help="Scene file (TOML).", show_default=False)],
     out: Annotated[Path, typer.Option(help="Folder for the picture; made where missing.")] = Path("out"),
-    method: Annotated[str | None, typer.Option(help="Method; default: the file's, or path_tracing.")] = None,
+    method: Annotated[
+        str | None, typer.Option(help="Method, or auto: one a layer, by what the scene is. Default: the file's.")
+    ] = None,
+    beside: Annotated[
+        str | None, typer.Option(metavar="METHOD", help="Render with this method too, and show both side by side.")
+    ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key, as in medium.anisotropy=0.3.")
     ] = None,
@@ -30,7 +35,10 @@ def render(
     seed: Annotated[int | None, typer.Option(help="Seed of the random numbers.")] = None,
     explain: Annotated[bool, typer.Option("--explain", help="Print what the scene lacks and so what is skipped.")] = False,
 ) -> None:
-    """Render SCENE and write DIR/<scene>.exr (all layers), .png (tone mapped) and .json (times, claims, settings)."""
+    """Render SCENE and write DIR/<scene>.exr (all layers), .png (tone mapped) and .json (times, claims, settings).
+
+    With --beside also DIR/<scene>.<METHOD>.exr and .png, and both pictures in DIR/<scene>.beside.png.
+    """
     overrides = list(set_ or [])
     for key, value in (("method", method), ("samples", samples), ("seed", seed)):
         if value is not None:
@@ -43,7 +51,7 @@ def render(
         for line in rendering.lacks(file.scene):
             print(line)
 
-    name = file.render.method
+    name = "the layers' methods" if file.render.layers and method is None else file.render.method
     goal = {"seconds": time_, "until_error": until_error}
     with jobs.stoppable() as stop, jobs.progress(f"{file.name}, {name}", total=100) as advance:
         done = 0.0
@@ -54,7 +62,7 @@ def render(
             done = max(done, min(share, 1.0))
 
         job = rendering.Job(out / f"{file.name}.parts", stop, {key: value for key, value in goal.items() if value is not None})
-        result = rendering.render_scene(file, on_progress=on_progress, job=job)
+        result = rendering.render_scene(file, method=method, on_progress=on_progress, job=job)
         stopped = bool(result.estimate.diagnostics.get("stopped", False))
         if not stopped:
             advance(100 * (1.0 - done))
@@ -65,6 +73,8 @@ def render(
         _write(file, result, out)
     except OSError as error:  # a disk that filled: some writers do not say which file
         raise OSError(f"cannot write the picture into {out}: {error.strerror or error}") from error
+    if beside is not None:
+        _write_beside(file, result, beside, out)
     if result.nonfinite_pixels:
         _say(f"error: {result.nonfinite_pixels} pixels are not finite (magenta in the PNG)")
         raise typer.Exit(1)
@@ -101,11 +111,17 @@ def _prepare(out: Path) -> None:
 def _explain(result: rendering.Rendering) -> None:
     for line in result.skipped:
         print(f"{result.method} skips: {line}")
-    for claim in result.claims:
+    for share in result.shares:
+        for claim, reason in zip(share.claims, share.reasons, strict=True):
+            print(f"{share.method} computes {claim.name}: {reason}" + (f"; partly: {claim.partial}" if claim.partial else ""))
+    for claim in () if result.shares else result.claims:
         print(f"{result.method} computes {claim.name}" + (f", partly: {claim.partial}" if claim.partial else ""))
     missing = rendering.unclaimed(result.claims)
-    if missing:
-        print(f"{result.method} does not compute {', '.join(missing)}")
+    zero = [name for name in missing if name not in result.missing]
+    if result.missing:
+        print(f"{'nobody computes' if result.shares else f'{result.method} does not compute'} {', '.join(result.missing)}")
+    if zero:
+        print(f"zero in this scene and not computed: {', '.join(zero)}")
 
 
 def _write(file: SceneFile, result: rendering.Rendering, out: Path) -> None:
@@ -130,6 +146,11 @@ def _write(file: SceneFile, result: rendering.Rendering, out: Path) -> None:
         | {
             "seconds": result.seconds,
             "stages": result.stages,
+            "shares": [
+                {"method": share.method, "layers": [claim.name for claim in share.claims], "why": list(share.reasons)}
+                for share in result.shares
+            ],
+            "missing": list(result.missing),
             "claims": [{"layers": claim.name, "partial": claim.partial} for claim in result.claims],
             "skipped": list(result.skipped),
             "nonfinite_pixels": result.nonfinite_pixels,
@@ -145,8 +166,43 @@ def _write(file: SceneFile, result: rendering.Rendering, out: Path) -> None:
     print(f"{png}  (exposure {exposure:+.2f} stops)")
     print(f"{exr}  ({len(layers)} layers: {', '.join(layers)})")
     print(f"{report}")
+    if result.missing and result.shares:
+        _say(f"warning: nobody computes {', '.join(result.missing)}; the picture lacks this light")
     times = ", ".join(f"{name} {value:.1f} s" for name, value in result.seconds.items())
     print(f"{times}; first picture {first_picture:.1f} s after the start")
+
+
+def _write_beside(file: SceneFile, result: rendering.Rendering, name: str, out: Path) -> None:
+    """The same scene by another method, and both pictures side by side with one exposure, their times and difference."""
+    with jobs.progress(f"{file.name}, {name}", total=1) as advance:
+        other = rendering.render_scene(file, method=name)
+        advance(1)
+    exr, png = (out / f"{file.name}.{name}{suffix}" for suffix in (".exr", ".png"))
+    image.write_exr(exr, image.estimate_channels(other.estimate), metadata={"scene": file.name, "method": other.method})
+    pictures = [np.asarray(total(x.estimate.mean)) for x in (result, other)]
+    exposure = image.choose_exposure(pictures[1]) if file.render.exposure == "auto" else file.render.exposure
+    image.write_png(png, pictures[1], exposure=exposure)
+    notes = [f"{x.method}, {x.seconds['plan'] + x.seconds['run']:.1f} s" for x in (result, other)]
+    both = out / f"{file.name}.beside.png"
+    picture_sheets.write_beside(both, pictures, notes, exposure=exposure)
+    print(f"{both}  ({notes[0]} | {notes[1]})")
+    names = sorted(set(NAMES) - set(rendering.unclaimed(result.claims)), key=NAMES.index)
+    try:
+        errors = image.compare(_as_picture(result), _as_picture(other), layers=names, block=4)
+    except ValueError as error:
+        _say(f"note: the pictures cannot be compared: {error}")
+        return
+    noise = errors["reference_noise"]
+    print(
+        f"difference over 4 x 4 pixels {errors['relative_l1']:.2%}, of the means {errors['bias']:+.2%}"
+        + (f"; noise of {name} {noise:.2%}" if noise is not None else "")
+    )
+
+
+def _as_picture(result: rendering.Rendering) -> image.Picture:
+    return image.Picture(
+        rgb=np.asarray(total(result.estimate.mean)), layers=result.estimate.mean, variance=result.estimate.variance
+    )
 
 
 def _finite(value: object) -> object:

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 
 from jaxvol import camera as cameras
 from jaxvol import first_hit, ray_casting
+from jaxvol.common_stages import CommonStages
 from jaxvol.direct import patterns
 from jaxvol.direct.connections import Context, context
 from jaxvol.direct.planning import Plan, claims, plan
@@ -61,9 +62,11 @@ def render(
     caster: ray_casting.Caster = None,
     progress: Callable[[float, float], None] | None = None,
     on_stage: Callable[[str], None] | None = None,
+    common: CommonStages | None = None,
 ) -> Estimate:
     """The three layers of a picture, each pixel averaged over its square; no variance. `auxiliary` is filled."""
-    kit = context(scene, plan, _some_rays(camera), caster=caster)
+    common = CommonStages(scene, camera) if common is None else common
+    kit = context(scene, plan, _some_rays(camera), caster=caster, marching=common.marching)
     if on_stage is not None:
         on_stage("tables")
 
@@ -73,7 +76,7 @@ def render(
 
     layers = _average(kit, make_rays, camera.height * camera.width, seed, progress, on_stage)
     layers = jax.tree.map(lambda x: x.reshape(camera.height, camera.width, 3), layers)
-    guides = first_hit.auxiliary(scene, camera, caster=kit.caster, num_steps=plan.num_cells)
+    guides = first_hit.auxiliary(scene, camera, caster=caster, num_steps=plan.num_cells, common=common)
     if on_stage is not None:
         on_stage("auxiliary")
     return Estimate(mean=layers, auxiliary=guides)

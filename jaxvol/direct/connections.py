@@ -119,10 +119,18 @@ def _with(scene, field, value):
     return eqx.tree_at(lambda s: getattr(s, field), scene, value, is_leaf=lambda x: x is None)
 
 
-def context(scene: Scene, plan: Any, view: Rays, *, caster: ray_casting.Caster = None) -> Context:
-    """Casters and tables for a scene and a few rays of the picture; eager. The caster of the mesh may be given."""
+def context(
+    scene: Scene,
+    plan: Any,
+    view: Rays,
+    *,
+    caster: ray_casting.Caster = None,
+    marching: extinction.MarchingMedium | None = None,
+) -> Context:
+    """Casters and tables for a scene and a few rays of the picture; eager. What is already there may be given."""
     caster = ray_casting.caster_for(scene.mesh) if caster is None else caster
-    marching = None if scene.medium is None else extinction.marching_medium(scene.medium)
+    if marching is None and scene.medium is not None:
+        marching = extinction.marching_medium(scene.medium)
     return Context(
         scene=scene,
         plan=plan,

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxvol import camera as cameras
-from jaxvol import extinction, media, ray_casting, sampling, segments
+from jaxvol import extinction, media, sampling, segments
 from jaxvol import interval_map as intervals
+from jaxvol.common_stages import CommonStages
 from jaxvol.interval_map import IntervalMap
 from jaxvol.methods.deep_screen_space import framebuffer, kernel
 from jaxvol.methods.deep_screen_space.planning import Plan, coarse_size
@@ -34,13 +34,19 @@ class ActiveRays(eqx.Module):
 
 
 def map_rays(
-    scene: Scene, camera: Camera, plan: Plan, caster, casters: tuple, *, seed: int, pixels: Int[np.ndarray, "n"] | None = None
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    common: CommonStages,
+    *,
+    seed: int,
+    pixels: Int[np.ndarray, "n"] | None = None,
 ) -> ActiveRays | None:
     """The interval maps of the rays (of `pixels`, default all) that show medium; None when none does. Eager.
 
-    Only rays that pass the medium's box are cast and marched, only those that meet some density are kept.
+    Only rays that pass the medium's box are marched, only those that meet some density are kept.
     """
-    rays = cameras.generate_rays(camera, cameras.pixel_centers(camera))
+    rays = common.center_rays
     origin = np.asarray(rays.origin[0])
     enter, leave = (np.asarray(t) for t in media.box_interval(scene.medium.bounds, rays.origin, rays.direction))
     for part in scene.medium.inclusions:  # they may stick out of the medium
@@ -54,14 +60,14 @@ def map_rays(
     capacity = coarse_size(pixel.size)
     pixel_padded = np.concatenate([pixel, np.full(capacity - pixel.size, pixel[-1])])
     direction = np.asarray(rays.direction)[pixel_padded]
-    depth, _ = ray_casting.intersect(caster, origin, direction, np.float32(np.inf))
+    depth = common.center_hits[0][pixel_padded]
     u, u_step = _jitter(jnp.uint32(seed), jnp.asarray(pixel_padded))
     u, u_step = (u, u_step) if plan.position == "jittered" else (None, None)
     g, overflows = None, 0
     if segments.is_box(scene.medium):
-        mapped = _map_box(scene.medium, origin, direction, np.asarray(depth), plan, u, u_step)
+        mapped = _map_box(scene.medium, origin, direction, depth, plan, u, u_step)
     else:
-        mapped, g, overflows = _map_regions(scene.medium, origin, direction, np.asarray(depth), plan, u, casters)
+        mapped, g, overflows = _map_regions(scene.medium, origin, direction, depth, plan, u, common)
     opaque = np.asarray(mapped.one_minus_transmittance).max(axis=0)[: pixel.size]
     shown = np.flatnonzero(opaque > _VISIBLE)
     if shown.size == 0:
@@ -96,9 +102,9 @@ def _map_box(medium, origin, direction, depth, plan, u, u_step):
     return intervals.interval_map(medium, origins, direction, start, depth, **options)
 
 
-def _map_regions(medium, origin, direction, depth, plan, u, casters):
+def _map_regions(medium, origin, direction, depth, plan, u, common):
     """Media bounded by meshes, with inclusions: sigma of every step from the pieces that its owners have of it."""
-    marching = extinction.marching_medium(medium)
+    marching, casters = common.marching, common.medium_casters
     pieces = segments.segments(medium, np.broadcast_to(origin, direction.shape), direction, depth, casters=casters)
     parts = []
     for begin in range(0, len(direction), _CHUNK):
@@ -169,9 +175,9 @@ def _own_cosines(mapped, g_steps, start, step):
     return eqx.tree_at(lambda m: m.weight, mapped, weight), g
 
 
-def transmittance_of(medium: Medium, casters: tuple, *, num_steps: int):
+def transmittance_of(medium: Medium, casters: tuple, *, num_steps: int, marching: extinction.MarchingMedium | None = None):
     """The function (origin, direction, distance) -> transmittance [n, 3] of segments, as stages take it. Eager."""
-    marching = extinction.marching_medium(medium)
+    marching = extinction.marching_medium(medium) if marching is None else marching
 
     def transmittance(origin, direction, distance):
         thickness = extinction.optical_thickness(

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol import ray_casting, segments
+from jaxvol import ray_casting
+from jaxvol.common_stages import CommonStages
 from jaxvol.layers import zeros
 from jaxvol.methods.deep_screen_space import framebuffer, lighting, reconstruction, splatting, surfels, tile_lists, transport
 from jaxvol.methods.deep_screen_space.camera_rays import ActiveRays, map_rays, transmittance_of
@@ -15,16 +16,8 @@ from jaxvol.methods.deep_screen_space.planning import LAYER, Plan, coarse_size, 
 from jaxvol.types import Camera, Estimate, Layers, Scene
 
 
-class Casters:
-    """What a frame casts rays with: the scene's surfaces and the medium's boundaries."""
-
-    def __init__(self, scene: Scene):
-        self.surfaces = ray_casting.caster_for(scene.mesh)
-        self.media = segments.medium_casters(scene.medium)
-
-
 def light_surfels(
-    scene: Scene, camera: Camera, plan: Plan, casters: Casters, *, seed: int
+    scene: Scene, camera: Camera, plan: Plan, common: CommonStages, *, seed: int
 ) -> tuple[LitSurfels, LitSurfels | None, int]:
     """Stages 1 and 2: lit Lambertian entries, glossy ones or None, and the number of surfels that found no slot."""
     eye = np.asarray(camera.world_from_camera)[:3, 3]
@@ -38,8 +31,8 @@ def light_surfels(
     lambert, glossy = lighting.illuminate(
         scene,
         cloud,
-        casters.surfaces,
-        transmittance_of(scene.medium, casters.media, num_steps=plan.light_steps),
+        common.caster,
+        _transmittance(common, num_steps=plan.light_steps),
         seed=seed,
         choices=plan.light_choices,
         scale=float(ray_casting.scene_scale(scene.mesh)),
@@ -47,7 +40,11 @@ def light_surfels(
     return lambert, glossy, int(lost)
 
 
-def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Plan, casters: Casters, *, seed: int):
+def _transmittance(common, *, num_steps):
+    return transmittance_of(common.scene.medium, common.medium_casters, num_steps=num_steps, marching=common.marching)
+
+
+def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Plan, common: CommonStages, *, seed: int):
     """Stage 5: (table, cell of every sample), or (None, None) without transport."""
     if plan.transport == "none":
         return None, None
@@ -63,8 +60,8 @@ def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Pla
     table = transport.build_table(
         lit,
         cells,
-        casters.surfaces,
-        transmittance_of(scene.medium, casters.media, num_steps=plan.transport_steps),
+        common.caster,
+        _transmittance(common, num_steps=plan.transport_steps),
         seed=seed,
         cluster_size=plan.cluster_size,
         resolution=plan.table_resolution,
@@ -162,9 +159,16 @@ def _nothing(name, value):
 
 
 def render(
-    scene: Scene, camera: Camera, plan: Plan, *, seed: int = 0, on_stage: Callable[[str], None] | None = None
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    seed: int = 0,
+    on_stage: Callable[[str], None] | None = None,
+    common: CommonStages | None = None,
 ) -> Estimate:
-    """The layer `volume_from_surface` of one frame, [H, W, 3]; `on_stage(name)` is called after each part of a stage.
+    """The layer `volume_from_surface` of one frame, [H, W, 3]; `on_stage(name)` is called after each part of a stage,
+    `common` holds what other methods have computed already.
 
     Diagnostics: pairs evaluated by level, lit entries, active pixels; `overflow` counts surfels without a slot and rays
     with too many boundaries (0 in a healthy frame).
@@ -179,13 +183,13 @@ def render(
     nothing = Estimate(mean=zeros((LAYER,), shape), diagnostics={"overflow": jnp.int32(0)})
     if not plan.active:
         return nothing
-    casters = Casters(scene)
-    lambert, glossy, lost = light_surfels(scene, camera, plan, casters, seed=seed)
+    common = CommonStages(scene, camera) if common is None else common
+    lambert, glossy, lost = light_surfels(scene, camera, plan, common, seed=seed)
     done("surfels", None)
     entries = [lit for lit in (lambert, glossy) if lit is not None and lit.area.shape[0] > 0]
     if not entries:
         return nothing
-    active = map_rays(scene, camera, plan, casters.surfaces, casters.media, seed=seed)
+    active = map_rays(scene, camera, plan, common, seed=seed)
     done("map", None)
     if active is None:
         return nothing
@@ -200,7 +204,7 @@ def render(
     for lit in entries:
         lit = padded_surfels(lit, plan)
         done("order", None)
-        table, cells = build_transport(scene, active, lit, plan, casters, seed=seed)
+        table, cells = build_transport(scene, active, lit, plan, common, seed=seed)
         done("table", None)
         images, counts = splat_levels(scene, active, lit, table, cells, plan, width=camera.width, seed=seed, done=done)
         for level, (tiles, slot) in enumerate(images):

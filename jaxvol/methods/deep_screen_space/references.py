@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxvol import lights, materials, phase, ray_casting, sampling
+from jaxvol.common_stages import CommonStages
 from jaxvol.methods.deep_screen_space import frame, kernel, splatting
 from jaxvol.methods.deep_screen_space.camera_rays import map_rays, transmittance_of
 from jaxvol.methods.deep_screen_space.planning import Plan
@@ -49,10 +50,10 @@ def exact_pairs(
     chunk: int = 64,
 ) -> Float[np.ndarray, "n 3"]:
     """A1 for flat pixel indices: every pair with its own shadow ray and `num_steps` steps of extinction; Lambert only."""
-    casters = frame.Casters(scene)
-    caster, transmittance = casters.surfaces, transmittance_of(scene.medium, casters.media, num_steps=num_steps)
-    lit, _, _ = frame.light_surfels(scene, camera, plan, casters, seed=seed)
-    active = map_rays(scene, camera, plan, caster, casters.media, seed=seed, pixels=pixels)
+    common = CommonStages(scene, camera)
+    caster, transmittance = common.caster, transmittance_of(scene.medium, common.medium_casters, num_steps=num_steps)
+    lit, _, _ = frame.light_surfels(scene, camera, plan, common, seed=seed)
+    active = map_rays(scene, camera, plan, common, seed=seed, pixels=pixels)
     place = {int(p): i for i, p in enumerate(active.pixel[: active.num_rays])}
     out = np.zeros((len(pixels), 3), np.float32)
     # One level that holds all distances.
@@ -124,9 +125,9 @@ def gather(
     """A2 for flat pixel indices: mean and standard error. From every sample of the plan's map `num_directions` rays by
     the phase function; where they meet a surface, one light sample. The n-th direction of all samples is one estimate.
     """
-    casters = frame.Casters(scene)
-    caster, transmittance = casters.surfaces, transmittance_of(scene.medium, casters.media, num_steps=num_steps)
-    active = map_rays(scene, camera, plan, caster, casters.media, seed=seed, pixels=pixels)
+    common = CommonStages(scene, camera)
+    caster, transmittance = common.caster, transmittance_of(scene.medium, common.medium_casters, num_steps=num_steps)
+    active = map_rays(scene, camera, plan, common, seed=seed, pixels=pixels)
     place = {int(p): i for i, p in enumerate(active.pixel[: active.num_rays])}
     known = np.array([place.get(int(p), -1) for p in pixels])
     rows = np.flatnonzero(known >= 0)

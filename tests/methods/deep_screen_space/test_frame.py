@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxvol import media
+from jaxvol.common_stages import CommonStages
 from jaxvol.methods import deep_screen_space as method
 from jaxvol.methods.deep_screen_space import frame, references, splatting
 from jaxvol.types import Mesh, Scene
@@ -214,7 +215,7 @@ def test_paper_mode_runs_and_is_far_off(cloud_scene, camera):
 
 def test_first_radius_unit_is_the_mean_lit_radiance(cloud_scene, camera):
     plan = method.plan(cloud_scene, camera, **SMALL)
-    lit, glossy, lost = frame.light_surfels(cloud_scene, camera, plan, frame.Casters(cloud_scene), seed=0)
+    lit, glossy, lost = frame.light_surfels(cloud_scene, camera, plan, CommonStages(cloud_scene, camera), seed=0)
     area, brightest = np.asarray(lit.area), np.asarray(lit.radiance).max(axis=1)
     np.testing.assert_allclose(frame.mean_radiance(lit), (area * brightest).sum() / area.sum(), rtol=1e-5)
     assert glossy is None and lost == 0
