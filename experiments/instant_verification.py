@@ -3,7 +3,7 @@
 Scenes: infinite medium (one ray past a point source, against quadrature of the exact fluence), homogeneous cube (g = 0,
 0.7), heterogeneous plume, fog with surfaces in it. Picture means of independent sets of lights, and of independent runs
 of the reference, are appended to files, so that a run goes on where the last one stopped; errors are their spread.
-Usage: python experiments/instant_verification.py [SCENE ...] [--sets 64] [--runs 32] [--minutes 4].
+Usage: python experiments/instant_verification.py [SCENE ...] [--sets 64] [--runs 32] [--minutes 4] [--side reference].
 """
 
 import argparse
@@ -30,7 +30,7 @@ SETTINGS = {
     "corner": {"num_paths": 65536, "num_direct": 8, "group_size": 100, "light_stride": 16},
 }
 SIZE = 24
-SAMPLES = {"cube": 256, "cube_g": 256, "plume": 256, "room": 64, "corner": 256}  # of one run of the reference
+SAMPLES = {"cube": 512, "cube_g": 512, "plume": 512, "room": 1024, "corner": 1024}  # of one run of the reference
 LANES = 256
 
 
@@ -89,13 +89,17 @@ def continued(path, function, number, deadline):
     return np.array(rows)
 
 
-def verify(name, sets, runs, minutes):
-    """Rows (scene, layer, mean, se, reference, its se, difference, z) of one scene."""
+def verify(name, sets, runs, minutes, side):
+    """Rows (scene, layer, mean, se, reference, its se, difference, z) of one scene; `side`: whose means are added to."""
     folder = out_folder()
-    share = 30.0 * minutes
-    found = continued(folder / f"means_{name}.csv", ours(name), sets, time.monotonic() + share)
-    exact = continued(folder / f"means_{name}_reference.csv", theirs(name), runs, time.monotonic() + share)
+    share = (60.0 if side != "both" else 30.0) * minutes
+    number = sets if side != "reference" else 0
+    found = continued(folder / f"means_{name}.csv", ours(name), number, time.monotonic() + share)
+    number = runs if side != "ours" else 0
+    exact = continued(folder / f"means_{name}_reference.csv", theirs(name), number, time.monotonic() + share)
     rows = []
+    if len(found) < 2 or len(exact) < 2:
+        return rows
     for i, layer in enumerate(NAMES):
         mean, reference = found[:, i].mean(), exact[:, i].mean()
         if reference == 0:
@@ -118,12 +122,15 @@ def main():
     parser.add_argument("--sets", type=int, default=64)
     parser.add_argument("--runs", type=int, default=32)
     parser.add_argument("--minutes", type=float, default=60.0, help="per scene; go on with the same command")
+    parser.add_argument("--side", choices=["both", "ours", "reference"], default="both", help="whose means to add to")
     arguments = parser.parse_args()
     rows = []
     for name in arguments.scenes:
-        rows += verify(name, arguments.sets, arguments.runs, arguments.minutes)
+        rows += verify(name, arguments.sets, arguments.runs, arguments.minutes, arguments.side)
         header = ["scene", "layer", "mean", "relative_se", "reference", "reference_se", "difference", "z"]
         write_csv(out_folder() / f"verification_{'_'.join(arguments.scenes)}.csv", header, rows)
+    if not rows:
+        return
     with figure(out_folder() / f"verification_{'_'.join(arguments.scenes)}.png", size=(7, 4.5)) as axes:
         y = np.arange(len(rows))
         axes.errorbar([100 * r[6] for r in rows], y, xerr=[100 * np.hypot(r[3], r[5]) for r in rows], fmt="o")
