@@ -19,6 +19,7 @@ COMMANDS = {
     "compare": "Print the error of one EXR picture against another as JSON.",
     "bake": "Bake light onto surfaces and into probes: EXR lightmap, GLB, .npz.",
     "tabulate": "Compute or verify tables of impulse responses.",
+    "benchmark": "Run time against error: scenes x methods x settings, with tables and plots.",
     "fit": "Run the fits behind the tables; CSV and figures.",
     "schema": "Print the JSON schema of scene files.",
 }
