@@ -20,6 +20,7 @@ COMMANDS = {
     "bake": "Bake light onto surfaces and into probes: EXR lightmap, GLB, .npz.",
     "tabulate": "Compute or verify tables of impulse responses.",
     "benchmark": "Run time against error: scenes x methods x settings, with tables and plots.",
+    "stress": "Random and extreme scenes through every method, checked by what must hold.",
     "fit": "Run the fits behind the tables; CSV and figures.",
     "schema": "Print the JSON schema of scene files.",
 }

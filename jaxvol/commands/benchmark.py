@@ -38,7 +38,7 @@ def benchmark(
     print(
         "\nPT s, Mitsuba s: their seconds to the same relMSE of the same layers; x: how many times faster the method is. "
         "> and <: told\nby the reference's noise only. *: some layer is computed in part. L1 and noise (of the reference) are "
-        f"over {table.block} x {table.block} pixels.\nLayers are paths from light (L) to eye (E) over surfaces (S) and volumes (V); "
+        f"over {table.block} x {table.block} pixels.\nLayers are paths from light (L) to eye (E), S surface, V volume; "
         "L**SE, L**VE: two vertices or more before the last."
     )
     for line in report.refusals(records):

@@ -1,0 +1,121 @@
+"""Run cases through methods, keep what was found (stress.jsonl), go on where it was stopped."""
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from jaxvol import jobs
+from jaxvol.stress import checks, extremes, scenes
+
+RESULTS = "stress.jsonl"
+# Of each class every second scene in other units, every tenth turned, every fourth furnace looked at for energy.
+_EVERY_UNITS, _EVERY_TURN, _EVERY_FURNACE = 2, 10, 4
+
+Record = dict[str, Any]
+
+
+def cases(first: int, num: int) -> Iterator[tuple[str, str, int | None, scenes.Config]]:
+    """(key, class, number or None for extremes, scene) of the extremes and of random scenes first .. first + num - 1."""
+    for name, config in extremes.extremes():
+        yield f"extreme: {name}", "extreme", None, config
+    for number in range(first, first + num):
+        name, config = scenes.random_scene(number)
+        yield f"random {number}", name, number, config
+
+
+def run_case(config: scenes.Config, number: int | None, name: str, method: str) -> Record:
+    """All checks of one scene by one method: {"refused": why} or {"failed": [...], "passed": [...]}."""
+    failed, passed = [], []
+
+    def note(what: str, found: str | None) -> None:
+        if found:
+            failed.append(f"{what}: {found}")
+        else:
+            passed.append(what)
+
+    start = time.perf_counter()
+    try:
+        layers = checks.render(config, method)
+    except checks.Refused as error:
+        return {"refused": str(error)}
+    problem = checks.sound(layers)
+    note("sound", problem)
+    if problem is None:
+        base = checks.picture(layers)
+        try:
+            note("linear", checks.linear(config, method, base))
+            turn = None if number is None else number // len(scenes.CLASSES)  # scenes of this class before
+            if turn is None or turn % _EVERY_UNITS == 0:
+                factor = 1 / checks.UNIT if turn is not None and turn % (2 * _EVERY_UNITS) else checks.UNIT
+                note("units", checks.unit_free(config, method, base, factor=factor))
+            if turn is not None and turn % _EVERY_TURN == 0:
+                note("turned", checks.turns(config, method))
+            if name.endswith("furnace") and turn % _EVERY_FURNACE == 0:
+                note("furnace", checks.furnace(config, method))
+        except checks.Refused as error:  # the scene was taken before: its other forms must be, but for numbers out of range
+            note("range" if "must be" in str(error) else "refused", None if "must be" in str(error) else str(error))
+    return {"failed": failed, "passed": passed, "seconds": time.perf_counter() - start}
+
+
+def run(
+    out: Path, *, first: int, num: int, methods: tuple[str, ...], stop: jobs.Stop | None = None, again: bool = False
+) -> list[Record]:
+    """All cases by all methods; those that `out` holds are taken from there, failed ones run again with `again`."""
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / RESULTS
+    done = _read(path)
+    wanted = [(key, name, number, config, m) for key, name, number, config in cases(first, num) for m in methods]
+    if again:
+        done = {k: r for k, r in done.items() if not r.get("failed")}
+    # Method by method and class by class, so that compiled programs are used again before they are dropped.
+    todo = sorted((w for w in wanted if (w[0], w[4]) not in done), key=lambda w: (w[4], w[1] != "extreme", w[1]))
+    with jobs.progress("stress", total=len(wanted)) as advance:
+        advance(len(wanted) - len(todo))
+        before = None
+        for count, (key, name, number, config, method) in enumerate(todo, start=1):
+            if stop:
+                break
+            if before not in (None, (method, name)):
+                checks.clear_caches()  # the next class has other shapes, and hundreds of programs would fill the memory
+            before = method, name
+            record = {"case": key, "class": name, "method": method} | run_case(config, number, name, method)
+            done[key, method] = record
+            advance(1, note=f"{method}, {key}")
+            if count % 20 == 0 or count == len(todo):
+                _write(path, done)
+    _write(path, done)
+    return [done[w[0], w[4]] for w in wanted if (w[0], w[4]) in done]
+
+
+def _read(path: Path) -> dict[tuple[str, str], Record]:
+    if not path.exists():
+        return {}
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    return {(r["case"], r["method"]): r for r in records}
+
+
+def _write(path: Path, records: dict[tuple[str, str], Record]) -> None:
+    jobs.write_bytes(path, "".join(json.dumps(r) + "\n" for r in records.values()).encode())
+
+
+def table(records: list[Record]) -> str:
+    """Cases tried, refused and failed, by method, and checks made."""
+    head = f"{'method':28s} {'scenes':>7s} {'random':>7s} {'refused':>8s} {'failed':>7s} {'checks':>7s}"
+    lines = [head + "  sound linear  units turned furnace"]
+    for method in dict.fromkeys(r["method"] for r in records):
+        mine = [r for r in records if r["method"] == method]
+        run_ = [r for r in mine if "refused" not in r]
+        made = {k: sum(k in r["passed"] for r in run_) for k in ("sound", "linear", "units", "turned", "furnace")}
+        total = sum(len(r["passed"]) + len(r["failed"]) for r in run_)
+        lines.append(
+            f"{method:28s} {len(run_):7d} {sum(r['class'] != 'extreme' for r in run_):7d} {len(mine) - len(run_):8d} "
+            f"{sum(bool(r['failed']) for r in run_):7d} {total:7d}  " + " ".join(f"{v:6d}" for v in made.values())
+        )
+    return "\n".join(lines)
+
+
+def failures(records: list[Record]) -> list[str]:
+    """One line for every check that failed."""
+    return [f"{r['method']}, {r['case']} ({r['class']}): {line}" for r in records for line in r.get("failed", ())]
