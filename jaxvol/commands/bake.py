@@ -1,5 +1,6 @@
 """`jaxvol bake`: light baked onto a scene's surfaces and into probes, as EXR lightmap, GLB and .npz."""
 
+import dataclasses
 import io
 import time
 from enum import StrEnum
@@ -9,10 +10,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from jaxvol import image, jobs, rendering
+from jaxvol import image, jobs, rendering, tables
 from jaxvol.layers import SURFACE
 from jaxvol.methods import impulse_response
-from jaxvol.methods.impulse_response import baking, gltf, lightmap, probes
+from jaxvol.methods.impulse_response import baking, gltf, lightmap, probes, receivers
 from jaxvol.scene import load_scene
 
 
@@ -22,6 +23,13 @@ class Target(StrEnum):
     lightmap = "lightmap"
     vertices = "vertices"
     probes = "probes"
+
+
+class Occlusion(StrEnum):
+    """What happens to scattered light of occluded emitters."""
+
+    march = "march"
+    drop = "drop"
 
 
 class Scattering(StrEnum):
@@ -42,7 +50,17 @@ def bake(
     resolution: Annotated[int, typer.Option(help="Texels along the lightmap's side.")] = 256,
     spacing: Annotated[float | None, typer.Option(help="Distance of probes; default: an eighth of the scene's size.")] = None,
     max_bounces: Annotated[int, typer.Option(help="Surface vertices after the receiver.")] = 6,
-    paper: Annotated[bool, typer.Option("--paper", help="The paper's mode: no image sources behind surfaces.")] = False,
+    paper: Annotated[bool, typer.Option("--paper", help="All of the paper's modes: those of the options below.")] = False,
+    image_source: Annotated[bool, typer.Option(help="Take off light from behind surfaces by image sources.")] = True,
+    back_scattering: Annotated[bool, typer.Option(help="Find patches beside and behind receivers.")] = True,
+    occlusion: Annotated[Occlusion, typer.Option(help="Scattered light of occluded emitters.")] = Occlusion.march,
+    contrast: Annotated[
+        float | None, typer.Option(help="Of density, above which a segment is marched; 1 = never.", min=0, max=1)
+    ] = None,
+    similarity: Annotated[bool, typer.Option(help="Multiple scattering by similarity to an isotropic medium.")] = False,
+    g_range: Annotated[float | None, typer.Option(help="Single scattering interpolated between three values of g.")] = None,
+    harmonics: Annotated[bool, typer.Option(help="SH of incident light in the lightmap's channels.")] = True,
+    table_file: Annotated[Path | None, typer.Option("--tables", help="Table file; default: the shipped set.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the scene.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the random numbers.", min=0)] = 0,
 ) -> None:
@@ -53,13 +71,21 @@ def bake(
     """
     chosen = list(dict.fromkeys(targets or [Target.lightmap]))
     file = load_scene(scene, overrides=list(set_ or []))
-    plan = impulse_response.plan(
-        file.scene, None, scattering=scattering.value, image=not paper, back_scattering=not paper, max_bounces=max_bounces
-    )
+    options = {"scattering": scattering.value, "max_bounces": max_bounces}
+    if paper:
+        options |= {"image": False, "back_scattering": False, "occlusion": "drop", "contrast": None}
+        options |= {"similarity": True, "g_range": 0.5 if g_range is None else g_range}
+    else:
+        options |= {"image": image_source, "back_scattering": back_scattering, "occlusion": occlusion.value}
+        options |= {"similarity": similarity, "g_range": g_range}
+        if contrast is not None:
+            options["contrast"] = contrast if contrast < 1 else None
+    plan = impulse_response.plan(file.scene, None, **options)
+    lookups = None if table_file is None else tables.load(table_file).lookups()
     jobs_of = {}
     for target in chosen:
         jobs_of[target] = _receivers(target, file.scene, resolution, spacing)
-    kit = impulse_response.prepare(file.scene, plan)
+    kit = impulse_response.prepare(file.scene, plan, responses_from=lookups)
     config = {
         "config": file.config,
         "plan": repr(plan),
@@ -67,6 +93,8 @@ def bake(
         "seed": seed,
         "resolution": resolution,
         "spacing": spacing,
+        "harmonics": harmonics,
+        "tables": None if table_file is None else str(table_file),
         "versions": rendering.versions(),
     }
     folder = out / f"{file.name}_bake.parts"
@@ -82,7 +110,7 @@ def bake(
             for target, (_, points, normals) in jobs_of.items():
                 results[target] = baking.bake(
                     kit,
-                    plan,
+                    dataclasses.replace(plan, harmonics=harmonics and target is Target.lightmap),
                     points,
                     normals,
                     name=target.value,
@@ -104,16 +132,23 @@ def bake(
         "receivers": total,
         "skipped": list(plan.skipped),
         "claims": [{"layers": c.name, "partial": c.partial} for c in impulse_response.claims(file.scene)],
-        "occluded_share": {target.value: result.occluded_share for target, result in results.items()},
+        "shares": {target.value: result.shares for target, result in results.items()},
         "notes": list(file.notes),
     }
     jobs.write_json(out / f"{file.name}_bake.json", report)
     for target, result in results.items():
-        if result.occluded_share > 0:
-            share = f"{result.occluded_share:.1%}"
-            print(f"{target.value}: {share} of the light scattered once was dropped because its emitter is occluded")
+        for name, meaning in _SHARES.items():
+            if result.shares[name] > 0:
+                print(f"{target.value}: {result.shares[name]:.1%} of {meaning}")
     parts.clear()
     print(f"{total} receivers, {samples} paths each, {seconds:.1f} s")
+
+
+_SHARES = {
+    "occluded_share": "the light scattered once was dropped because its emitter is occluded",
+    "marched_share": "the segments at receivers were marched instead of looked up",
+    "beyond_share": "the lookups lay beyond the tables' largest optical thickness, and were continued as an exponential",
+}
 
 
 def _receivers(target, scene, resolution, spacing):
@@ -154,6 +189,8 @@ def _write_lightmap(what: lightmap.Lightmap, baked: baking.Baked, out: Path, nam
     outgoing = picture(reflected * baking.total(baked))
     images = {"": outgoing, "irradiance": picture(baking.total(baked)), "albedo": picture(what.albedo)}
     images |= {layer: picture(reflected * baked.irradiance[layer]) for layer in SURFACE}
+    if baked.harmonics is not None:
+        images |= {receivers.harmonic_name(i): picture(baked.harmonics[:, i]) for i in range(baked.harmonics.shape[1])}
     images["variance"] = picture(reflected * reflected * baked.variance)
     channels = {
         f"{layer}.{letter}".lstrip("."): values[..., c] for layer, values in images.items() for c, letter in enumerate("RGB")

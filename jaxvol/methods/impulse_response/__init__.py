@@ -3,14 +3,17 @@
 How a medium spreads the light of a point, directional or differential area emitter, seen from a receiver, is tabulated
 once (`jaxvol.tables`). Baking traces surface paths only and weights each segment with the table.
 
-Stages: `lookup` resamples the tables for a medium (sections 4.3 to 4.5); `shading` turns zonal and mirror-symmetric
-radiance into irradiance (section 5, appendix A); `emitters` is the light of one emitter at a receiver, with the image
-source that keeps light from coming back out of a surface (our addition); `surface_paths` and `gather` trace (section 5,
-back-scattering of 5.2 in area form); `estimate` collects layers; `rendering` shades first hits.
+Stages: `lookup` resamples the tables for a medium (sections 4.3 to 4.5); `receivers` and `shading` turn zonal and
+mirror-symmetric radiance into irradiance, reflected light or SH (section 5, appendix A); `emitters` is the light of one
+emitter at a receiver, with the image source that keeps light from coming back out of a surface (our addition);
+`light_sources`, `surface_paths` and `gather` trace (section 5, back-scattering of 5.2 in area form); `marched` integrates
+single segments where an occluder or the density's contrast makes the tables wrong (our addition); `estimate` collects
+layers; `baking`, `lightmap`, `probes` and `gltf` make files; `rendering` shades first hits.
 
-It cannot: take light around occluders (dropped and counted, the paper's rule), know the bounds of a medium beyond the
-optical thickness of each segment, nor contrast of density along one (the mean serves); scatter light out of a spot's cone;
-reflect Phong lobes in `render`; bend rays.
+It cannot: know the bounds of a medium beyond the optical thickness of each segment; be exact about light scattered more than
+once where density varies or occluders stand (its last leg alone is traced, at receivers only; at further vertices
+the mean along each segment and the paper's rule serve); scatter light out of a spot's cone to receivers beside it;
+reflect in Phong lobes after the first surface; bend rays.
 """
 
 from jaxvol.methods.impulse_response.estimate import irradiance

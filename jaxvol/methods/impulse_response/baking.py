@@ -14,11 +14,12 @@ _PART = 4096  # receivers at a time
 
 
 class Baked(NamedTuple):
-    """Irradiance at receivers by layer, variance of its total, and the share of scattered light that occluders took."""
+    """Irradiance at receivers by layer, variance of its total, and `estimate.irradiance`'s shares."""
 
     irradiance: dict[str, np.ndarray]  # each [N, 3]
     variance: np.ndarray  # [N, 3], sum over layers
-    occluded_share: float
+    shares: dict[str, float]  # dropped because occluded, marched, beyond the tables
+    harmonics: np.ndarray | None = None  # [N, 9, 3], SH of incident radiance
 
 
 class Interrupted(Exception):
@@ -53,19 +54,24 @@ def bake(
             result = estimate.bake(kit, points[rows], normals[rows], plan, samples=samples, seed=seed, first_item=first)
             done = {layer: np.asarray(getattr(result.mean, layer)) for layer in SURFACE}
             done["variance"] = sum(np.asarray(getattr(result.variance, layer)) for layer in SURFACE)
-            done["occluded_share"] = np.asarray(result.diagnostics["occluded_share"])
+            done |= {name: np.asarray(value) for name, value in result.diagnostics.items()}
             if parts is not None:
                 parts.put(label, done)
         found.append(done)
         if on_progress is not None:
             on_progress(len(done["variance"]))
+    size = np.array([len(part["variance"]) for part in found], np.float64)
     once = np.array([part["surface_from_volume"].sum() for part in found], np.float64)
-    share = np.array([float(part["occluded_share"]) for part in found])
-    lost = once * share / np.maximum(1 - share, 1e-6)
+    dropped = np.array([float(part["occluded_share"]) for part in found])
+    lost = once * dropped / np.maximum(1 - dropped, 1e-6)
+    shares = {"occluded_share": float(lost.sum() / max(once.sum() + lost.sum(), 1e-30))}
+    for name in ("marched_share", "beyond_share"):
+        shares[name] = float(np.average([float(part[name]) for part in found], weights=size))
     return Baked(
         irradiance={layer: np.concatenate([part[layer] for part in found]) for layer in SURFACE},
         variance=np.concatenate([part["variance"] for part in found]),
-        occluded_share=float(lost.sum() / max(once.sum() + lost.sum(), 1e-30)),
+        shares=shares,
+        harmonics=np.concatenate([part["harmonics"] for part in found]) if plan.harmonics else None,
     )
 
 

@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
+from jaxtyping import Array, ArrayLike
 
 from jaxvol import zonal_lookup
 from jaxvol.layers import SURFACE, from_items
-from jaxvol.methods.impulse_response import gather, planning
+from jaxvol.methods.impulse_response import gather, planning, receivers
 from jaxvol.methods.impulse_response.planning import Plan
+from jaxvol.methods.impulse_response.receivers import HARMONICS
 from jaxvol.types import Estimate, Scene
 
 Progress = Callable[[float], None]
@@ -17,7 +18,7 @@ Progress = Callable[[float], None]
 
 def needs_paths(kit: gather.Kit) -> bool:
     """Whether anything beside delta lights' own light arrives."""
-    return kit.max_bounces > 0 or kit.scene.area_lights is not None or kit.scene.environment is not None
+    return kit.max_bounces > 0 or kit.scene.area_lights is not None or kit.scene.environment is not None or kit.marches
 
 
 def lanes_for(items: int, limit: int) -> int:
@@ -46,8 +47,11 @@ def irradiance(
     `surface_from_light` is light straight from emitters, `surface_from_volume` light scattered once on the way,
     `surface_from_surface` light from one surface, `surface_from_multiple` the rest. `options` as in `plan` where none is
     given. `first_item` numbers the receivers, so that a bake in parts draws the same numbers. Biased by what the plan
-    skips, by the tables' infinite medium, and in heterogeneous media by their mean along each segment. Diagnostics:
-    `occluded_share` is single scattering from occluded emitters that was dropped, over all of it.
+    skips, by the tables' infinite medium, and in heterogeneous media by their mean along each segment that is not marched.
+
+    Diagnostics: `occluded_share`, single scattering from occluded emitters that was dropped, over all of it; of the
+    receivers' own segments `marched_share`; of all lookups `beyond_share`, past the largest tau of the tables; `segments`,
+    the number of path and shadow rays of live paths.
     """
     decided = planning.plan(scene, None, **options) if plan is None else plan
     if samples < 1:
@@ -70,79 +74,90 @@ def bake(
     first_item: int = 0,
     on_progress: Progress | None = None,
 ) -> Estimate:
-    """`irradiance` with everything prepared."""
+    """`irradiance` with everything prepared; with harmonics in the plan, `diagnostics["harmonics"]` holds
+    the SH of incident radiance [*batch, 9, 3]."""
     shape = points.shape[:-1]
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
-    num = points.shape[0]
-    fixed = _delta(kit, points, normals, plan.num_lanes)
-    mean = {name: np.zeros((num, 3)) for name in SURFACE}
-    square = {name: np.zeros((num, 3)) for name in SURFACE}
-    lost = fixed.pop("occluded")
-    if needs_paths(kit):
-        dropped = np.zeros((num, 3))
-        for lane_receiver, found in _paths(kit, points, normals, plan.num_lanes, samples, seed, first_item, on_progress):
+    tally = gather.Tally()
+    rows = (1 + HARMONICS, 3) if plan.harmonics else (3,)
+    fixed = {name: np.zeros((points.shape[0], *rows)) for name in (*SURFACE, "occluded")}
+    mean = {name: np.zeros((points.shape[0], *rows)) for name in (*SURFACE, "occluded")}
+    square = {name: np.zeros((points.shape[0], *rows)) for name in SURFACE}
+    for first in range(0, points.shape[0], plan.num_lanes):
+        part = slice(first, first + plan.num_lanes)
+        arguments = (kit, points[part], normals[part], plan)
+        for name, value in _delta(*arguments, tally).items():
+            fixed[name][part] = value
+        if not needs_paths(kit):
+            continue
+        for found in _paths(*arguments, samples, seed, first_item + first, tally):
             for name, value in found.items():
-                if name == "occluded":
-                    _add(dropped, lane_receiver, value)
-                else:
-                    _add(mean[name], lane_receiver, value)
-                    _add(square[name], lane_receiver, value * value)
-        lost = lost + dropped / samples
+                mean[name][part] += value.sum(axis=0)
+                if name in square:
+                    square[name][part] += np.square(value, dtype=np.float64).sum(axis=0)
+        if on_progress is not None:
+            on_progress(min(first + plan.num_lanes, points.shape[0]) / points.shape[0])
     variance = {}
     for name in SURFACE:
         mean[name] /= samples
-        spread = np.maximum(square[name] / samples - mean[name] ** 2, 0) / max(samples - 1, 1)
-        variance[name] = spread.astype(np.float32).reshape(*shape, 3)
-        mean[name] = (mean[name] + fixed.get(name, 0)).astype(np.float32).reshape(*shape, 3)
-    once = float(mean["surface_from_volume"].sum())
-    share = float(lost.sum()) / max(once + float(lost.sum()), 1e-30)
+        variance[name] = np.maximum(square[name] / samples - mean[name] ** 2, 0) / max(samples - 1, 1)
+        mean[name] += fixed[name]
+    lost = float(_first(fixed["occluded"] + mean["occluded"] / samples).sum())
+    once = float(_first(mean["surface_from_volume"]).sum())
+    diagnostics = {
+        "occluded_share": jnp.float32(lost / max(once + lost, 1e-30)),
+        "marched_share": jnp.float32(_share(tally, "marched", "segments")),
+        "beyond_share": jnp.float32(_share(tally, "beyond", "lookups")),
+        "segments": jnp.float32(tally.get("traced", 0)),
+    }
+    if plan.harmonics:
+        diagnostics["harmonics"] = jnp.asarray(_shaped(sum(mean[name] for name in SURFACE)[:, 1:], shape))
     return Estimate(
-        mean=from_items({name: jnp.asarray(value) for name, value in mean.items()}),
-        variance=from_items({name: jnp.asarray(value) for name, value in variance.items()}),
+        mean=from_items({name: jnp.asarray(_shaped(_first(mean[name]), shape)) for name in SURFACE}),
+        variance=from_items({name: jnp.asarray(_shaped(_first(variance[name]), shape)) for name in SURFACE}),
         num_samples=jnp.float32(samples),
-        diagnostics={"occluded_share": jnp.float32(share)},
+        diagnostics=diagnostics,
     )
 
 
-def _add(total, receiver, value):
-    for channel in range(3):
-        total[:, channel] += np.bincount(receiver, weights=value[:, channel], minlength=total.shape[0])
+def _share(tally, part, whole):
+    return float(tally.get(part, 0)) / max(float(tally.get(whole, 0)), 1.0)
 
 
-def _chunks(total, limit):
-    """(first, lanes) of runs over `total` items, the last one padded."""
-    lanes = lanes_for(total, limit)
-    return [(first, lanes) for first in range(0, total, lanes)]
+def _first(value):
+    """Irradiance among a receiver's rows."""
+    return value if value.ndim == 2 else value[:, 0]
 
 
-def _delta(kit, points, normals, limit):
+def _shaped(value, shape):
+    return value.astype(np.float32).reshape(*shape, *value.shape[1:])
+
+
+def receiver_of(plan: Plan, normals: Array) -> receivers.Receiver:
+    """What a plan asks to be made of incident light."""
+    return receivers.Incident(normals) if plan.harmonics else receivers.Irradiance(normals)
+
+
+def _delta(kit, points, normals, plan, tally):
     """Light of delta lights at every receiver, by layer, and what was dropped."""
+    num = points.shape[0]
+    index = np.arange(lanes_for(num, plan.num_lanes)) % num
+    receiver = receiver_of(plan, jnp.asarray(normals[index]))
+    found = gather.delta_arrivals(kit, receiver, jnp.asarray(points[index]), tally)
     names = ("surface_from_light", "surface_from_volume", "surface_from_multiple", "occluded")
-    parts = {name: [] for name in names}
-    for first, lanes in _chunks(points.shape[0], limit):
-        index = np.minimum(first + np.arange(lanes), points.shape[0] - 1)
-        found = gather.delta_arrivals(kit, jnp.asarray(points[index]), jnp.asarray(normals[index]))
-        for name, value in zip(names, found, strict=True):
-            parts[name].append(np.asarray(value)[: points.shape[0] - first])
-    return {name: np.concatenate(values) for name, values in parts.items()}
+    return {name: np.asarray(value)[:num] for name, value in zip(names, found, strict=True)}
 
 
-def _paths(kit, points, normals, limit, samples, seed, first_item, on_progress):
-    """Receivers and layers of every chunk of paths; item = receiver, so that results do not depend on the chunks."""
-    total = points.shape[0] * samples
-    for first, lanes in _chunks(total, limit):
-        flat = np.minimum(first + np.arange(lanes, dtype=np.int64), total - 1)
-        receiver, sample = flat // samples, flat % samples
-        item = jnp.asarray(first_item + receiver, jnp.int32)
-        found = gather.path_arrivals(
-            kit,
-            jnp.asarray(points[receiver]),
-            jnp.asarray(normals[receiver]),
-            item,
-            jnp.asarray(sample, jnp.int32),
-            jnp.uint32(seed),
-        )
-        count = min(lanes, total - first)
-        yield receiver[:count], {name: np.asarray(value, np.float64)[:count] for name, value in found.items()}
-        if on_progress is not None:
-            on_progress((first + count) / total)
+def _paths(kit, points, normals, plan, samples, seed, first_item, tally):
+    """Layers [replicas, receivers, ...] of one batch of paths after another; item = receiver, whatever the batches."""
+    num = points.shape[0]
+    lanes = lanes_for(num * samples, plan.num_lanes)
+    replicas = lanes // num
+    index = np.arange(lanes) % num
+    item, seed = jnp.asarray(first_item + index, jnp.int32), jnp.uint32(seed)
+    position, receiver = jnp.asarray(points[index]), receiver_of(plan, jnp.asarray(normals[index]))
+    for first in range(0, samples, replicas):
+        sample = jnp.asarray(first + np.arange(lanes) // num, jnp.int32)
+        found = gather.path_arrivals(kit, receiver, position, item, sample, seed, tally)
+        count = min(replicas, samples - first)
+        yield {name: np.asarray(value)[: count * num].reshape(count, num, *value.shape[1:]) for name, value in found.items()}

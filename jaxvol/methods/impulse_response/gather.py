@@ -1,7 +1,8 @@
 """Stage 3, gathering: light from every emitter at receivers, and along surface paths; rays are cast between jitted steps.
 
-Light scattered on the way from an occluded emitter or patch is dropped (section 5.2, the paper's rule); the share of single
-scattering that is lost at the receivers themselves is counted.
+Segments that end at the receivers themselves and are cut by an occluder, or lie in a medium of much contrast, are integrated by
+`marched` (random, counted in `marched`); with `occlusion = "drop"` the scattered light of occluded emitters is dropped and
+counted (section 5.2, the paper's rule), as it is at all further vertices.
 """
 
 from functools import partial
@@ -12,14 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxvol import extinction, lights, ray_casting, sampling
-from jaxvol.methods.impulse_response import emitters, surface_paths
+from jaxvol import extinction, ray_casting, sampling, segments
+from jaxvol.methods.impulse_response import emitters, light_sources, marched, surface_paths
+from jaxvol.methods.impulse_response.light_sources import DELTA, Light, delta_lights
 from jaxvol.methods.impulse_response.lookup import Responses
-from jaxvol.sampling import dot
+from jaxvol.methods.impulse_response.receivers import Irradiance, Receiver, first_row, like
 from jaxvol.types import Medium, Scene
 
 _STREAM = sampling.stream("impulse_response.lights")
-DELTA = ("point", "spot", "directional")
+_PICK = sampling.stream("impulse_response.light_lookups")
+_MARCHED = sampling.stream("impulse_response.marched")
+# Segments of the receivers themselves and those marched; lookups and those past the tables' tau; all segments of live paths.
+COUNTS = ("segments", "marched", "lookups", "beyond", "traced")
 
 
 class Kit(eqx.Module):
@@ -36,95 +41,56 @@ class Kit(eqx.Module):
     num_steps: int = eqx.field(static=True, default=1)
     max_bounces: int = eqx.field(static=True, default=8)
     shares: tuple[float, float, float] = eqx.field(static=True, default=(1.0, 0.0, 0.0))
+    march_occluded: bool = eqx.field(static=True, default=False)
+    contrast: float | None = eqx.field(static=True, default=None)  # above it segments are marched; None = never
+    multiple: bool = eqx.field(static=True, default=True)
+    open: bool = eqx.field(static=True, default=False)  # all faces in one plane: nothing occludes
+
+    @property
+    def marches(self) -> bool:
+        """Whether any segment may be marched."""
+        return self.responses is not None and (self.march_occluded or self.contrast is not None)
 
 
-class Light(eqx.Module):
-    """One emitter seen from each receiver; `strength` multiplies the response of a unit emitter."""
+class Tally(dict):
+    """Counts of `COUNTS`, summed as they come; values stay on the device until read."""
 
-    direction: Float[Array, "n 3"]
-    distance: Float[Array, "n"]  # inf for light from infinity
-    strength: Float[Array, "n 3"]  # intensity; irradiance facing it; or radiance over density
-    normal: Float[Array, "n 3"] | None = None  # of area emitters
-
-
-def delta_lights(scene: Scene) -> list[tuple[str, int]]:
-    """Kind and index of every point, spot and directional light."""
-    found = []
-    for kind in DELTA:
-        group = getattr(scene, f"{kind}_lights")
-        if group is not None:
-            found += [(kind, i) for i in range(group.direction.shape[0] if kind == "directional" else group.position.shape[0])]
-    return found
-
-
-@partial(jax.jit, static_argnames="kind")
-def _see(scene, position, kind, index, u):
-    """The light of a kind: `index` [n] for point, spot and directional ones, a random one of the rest by u."""
-    if kind in ("point", "spot"):
-        group = scene.point_lights if kind == "point" else scene.spot_lights
-        delta = group.position[index] - position
-        distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
-        direction = delta / distance[:, None]
-        strength = group.intensity[index]
-        if kind == "spot":
-            strength = strength * lights.spot_falloff(group, index, -direction)[:, None]
-        return Light(direction, distance, strength)
-    infinite = jnp.full(position.shape[0], jnp.inf, jnp.float32)
-    if kind == "directional":
-        return Light(-scene.directional_lights.direction[index], infinite, scene.directional_lights.irradiance[index])
-    if kind == "environment":
-        direction, pdf = lights.sample_environment(scene.environment, u[0], u[1])
-        return Light(direction, infinite, lights.environment_radiance(scene.environment, direction) / pdf[:, None])
-    group, mesh = scene.area_lights, scene.mesh
-    face = group.face[sampling.sample_cdf(u[2], group.cdf)]
-    a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
-    w1, w2 = sampling.sample_triangle(u[0], u[1])
-    delta = a + w1[:, None] * (b - a) + w2[:, None] * (c - a) - position
-    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
-    emission = mesh.emission[face]
-    density = lights.luminance(emission) / group.total  # 1/area
-    normal = sampling.normalize(jnp.cross(b - a, c - a))
-    return Light(delta / distance[:, None], distance, emission / density[:, None], normal)
-
-
-@jax.jit
-def _shadow_ray(scale, position, normal, light):
-    """From the lifted receiver to the lifted emitter."""
-    start = surface_paths.lifted(position, normal, scale)
-    far = jnp.where(jnp.isinf(light.distance), 0.0, light.distance)
-    end = position + far[:, None] * light.direction
-    if light.normal is not None:
-        end = surface_paths.lifted(end, light.normal, scale)
-    way = end - start
-    length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-20))
-    infinite = jnp.isinf(light.distance)
-    direction = jnp.where(infinite[:, None], light.direction, way / length[:, None])
-    return start, direction, jnp.where(infinite, jnp.inf, length)
+    def count(self, **values: ArrayLike) -> None:
+        """Add to some counts."""
+        for name, value in values.items():
+            self[name] = self.get(name, 0) + value
 
 
 @partial(jax.jit, static_argnames="image")
-def _arrivals(responses, normal, light, visible, tau, *, image):
-    """Irradiance (attenuated, scattered once, more often), and what was scattered once on occluded ways."""
-    cosine = jnp.maximum(dot(normal, light.direction), 0.0)
-    infinite = light.normal is None and jnp.isinf(light.distance)
-    distance = jnp.where(jnp.isinf(light.distance), 1.0, light.distance)
-    direct = (cosine / (distance * distance))[:, None] * light.strength
+def _arrivals(responses, receiver, light, visible, tau, pick, *, image):
+    """What a receiver makes of one emitter's light: attenuated; and scattered once and more often, visible or not."""
+    strength = jnp.where(visible[:, None], light.strength, 0.0)
+    if not light.infinite:
+        strength = strength / (light.distance * light.distance)[:, None]
     if light.normal is not None:
-        direct = direct * jnp.maximum(-dot(light.normal, light.direction), 0.0)[:, None]
-    seen = visible[:, None]
+        strength = strength * jnp.maximum(-sampling.dot(light.normal, light.direction), 0.0)[:, None]
     if tau is not None:
-        direct = direct * jnp.exp(-tau)
-    direct = jnp.where(seen, direct, 0.0)
+        strength = strength * jnp.exp(-tau)
+    direct = receiver.straight(light.direction, strength)
     if responses is None:
-        return direct, jnp.zeros_like(direct), jnp.zeros_like(direct), jnp.zeros_like(direct)
+        return direct, jnp.zeros_like(direct), jnp.zeros_like(direct)
     if light.normal is not None:
-        once, more = emitters.patch_arrivals(responses, normal, light.direction, distance, light.normal, tau, image=image)
+        once, more = emitters.patch_arrivals(
+            responses, receiver, light.direction, light.distance, light.normal, tau, image=image, pick=pick
+        )
+    elif light.infinite:
+        once, more = emitters.directional_arrivals(responses, receiver, light.direction, tau, image=image, pick=pick)
     else:
-        near = emitters.point_arrivals(responses, normal, light.direction, distance, tau, image=image)
-        sky = emitters.directional_arrivals(responses, normal, light.direction, tau, image=image)
-        once, more = (jnp.where(infinite[:, None], b, a) for a, b in zip(near, sky, strict=True))
-    once, more = once * light.strength, more * light.strength
-    return direct, jnp.where(seen, once, 0.0), jnp.where(seen, more, 0.0), jnp.where(seen, 0.0, once)
+        once, more = emitters.point_arrivals(responses, receiver, light.direction, light.distance, tau, image=image, pick=pick)
+    weight = like(light.strength, once)
+    return direct, once * weight, more * weight
+
+
+@jax.jit
+def _beyond(responses, tau, counted):
+    grid = responses.point[0]
+    limit = grid.multiple_max
+    return jnp.sum(counted & jnp.any(tau > limit, axis=-1)), jnp.sum(counted)
 
 
 def thickness(kit: Kit, origin, direction, t_max) -> Float[Array, "n 3"] | None:
@@ -137,48 +103,226 @@ def thickness(kit: Kit, origin, direction, t_max) -> Float[Array, "n 3"] | None:
     )
 
 
-def light_from(kit: Kit, position, normal, kind: str, index, u) -> tuple[Array, Array, Array, Array]:
-    """Light of one emitter of a kind at each receiver: attenuated, once, more often, once but occluded; W/m2."""
-    light = _see(kit.scene, position, kind, index, u)
-    start, direction, length = _shadow_ray(kit.faces.scale, position, normal, light)
-    visible = ~np.asarray(ray_casting.occluded(kit.caster, start, direction, length * (1 - 1e-5)))
-    tau = thickness(kit, position, light.direction, light.distance)
-    return _arrivals(kit.responses, normal, light, jnp.asarray(visible), tau, image=kit.image)
+def _occluded(kit, origin, direction, length):
+    if kit.open:
+        return np.zeros(origin.shape[0], bool)
+    return np.asarray(ray_casting.occluded(kit.caster, origin, direction, length))
 
 
-def delta_arrivals(kit: Kit, position: ArrayLike, normal: ArrayLike) -> tuple[Array, Array, Array, Array]:
-    """Light of all point, spot and directional lights at the receivers: no noise. As `light_from`, summed."""
-    total = [jnp.zeros(position.shape, jnp.float32)] * 4
+def by_marching(kit: Kit, position, normal, light: Light, visible: np.ndarray) -> np.ndarray:
+    """Which segments the tables do not fit: occluded ones where asked for, and those of much contrast."""
+    chosen = np.zeros(visible.shape, bool)
+    if kit.march_occluded:
+        chosen |= ~visible
+    if kit.contrast is not None:
+        chosen |= np.asarray(marched.contrast(kit.marching, position, normal, light)) > kit.contrast
+    return chosen
+
+
+def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light, chosen: np.ndarray, u):
+    """(once, more often) of the chosen segments by one random scatter point each, zeros elsewhere."""
+    rows = np.flatnonzero(chosen)
+    if rows.size == 0:
+        zero = jnp.zeros(jax.eval_shape(receiver.straight, light.direction, light.strength).shape, jnp.float32)
+        return zero, zero
+    num = chosen.shape[0]
+    lanes = max(num // 8, 1) if rows.size <= num // 8 else num  # two sizes, so two compilations
+    rows = np.concatenate([rows, np.full(lanes - rows.size, rows[0])])
+    part, position, index, u, seen = jax.tree.map(
+        lambda x: x[rows] if jnp.shape(x)[:1] == (num,) else x, (receiver, position, index, u, light)
+    )
+    where = marched.place(kit.marching, position, part.normal, seen, u, num_steps=kit.num_steps)
+    points = position + where.distance[:, None] * where.direction
+    start = surface_paths.lifted(position, part.normal, kit.faces.scale)
+    reached = ~_occluded(kit, start, where.direction, where.distance)
+    again = light_sources.see_again(kit.scene, position, kind, index, seen, points)
+    lit = ~_occluded(kit, *_shortened(*light_sources.shadow_ray(kit.faces.scale, points, None, again)))
+    near = thickness(kit, position, where.direction, where.distance)
+    far = thickness(kit, points, again.direction, again.distance)
+    density = _density(kit, points)
+    lit, reached = jnp.asarray(lit), jnp.asarray(reached)
+    found = marched.gather(
+        kit.scene.medium,
+        kit.responses,
+        part,
+        where,
+        density,
+        again,
+        reached,
+        lit,
+        near,
+        far,
+        multiple=kit.multiple,
+        image=kit.image,
+    )
+    count = int(chosen.sum())
+    return tuple(_scatter(value, rows[:count], num) for value in found)
+
+
+def _scatter(value, rows, num):
+    whole = np.zeros((num, *value.shape[1:]), np.float32)
+    whole[rows] = np.asarray(value)[: rows.size]
+    return jnp.asarray(whole)
+
+
+def _shortened(origin, direction, length):
+    return origin, direction, length * (1 - 1e-5)
+
+
+def _density(kit, points):
+    medium = kit.scene.medium
+    if segments.is_box(medium):
+        return extinction.region_density(kit.marching, 0, points)
+    region = np.asarray(segments.region_at(medium, points, casters=kit.medium_casters))
+    total = jnp.zeros(points.shape[0], jnp.float32)
+    for number in range(len(kit.marching.regions)):
+        inside = jnp.asarray(region == number)
+        total = jnp.where(inside, extinction.region_density(kit.marching, number, points), total)
+    return total
+
+
+def light_from(
+    kit: Kit,
+    receiver: Receiver,
+    position,
+    kind: str,
+    index,
+    u,
+    *,
+    own: bool,
+    tally: Tally,
+    marching_u=None,
+    pick=None,
+    smooth: bool = True,
+) -> tuple[Array, Array, Array, Array]:
+    """Light of one emitter of a kind at each receiver: attenuated, once, more often, once but occluded and dropped.
+
+    `pick` chooses single nodes of the tables. `own`: the receivers are those of the bake, whose segments may be marched: with
+    the numbers `marching_u`, or left out where None. `smooth` False leaves out what `marching_u` None gives: the two add up.
+    """
+    light = light_sources.see(kit.scene, position, kind, index, u)
+    ray = _shortened(*light_sources.shadow_ray(kit.faces.scale, position, receiver.normal, light))
+    visible = ~_occluded(kit, *ray)
+    by_march = own and kit.marches
+    chosen = by_marching(kit, position, receiver.normal, light, visible) if by_march else None
+    direct = once = more = lost = None
+    if smooth:
+        tau = thickness(kit, position, light.direction, light.distance)
+        direct, once, more = _arrivals(kit.responses, receiver, light, jnp.asarray(visible), tau, pick, image=kit.image)
+        if kit.responses is not None:
+            by_table = visible if chosen is None else visible & ~chosen
+            dropped = ~visible if chosen is None else ~visible & ~chosen
+            once, more, lost = _split(once, more, jnp.asarray(by_table), jnp.asarray(dropped))
+            beyond, lookups = _beyond(kit.responses, tau, jnp.asarray(by_table))
+            tally.count(beyond=beyond, lookups=lookups)
+        else:
+            lost = jnp.zeros_like(direct)
+        if own and kit.responses is not None:
+            tally.count(segments=visible.size, marched=0 if chosen is None else int(chosen.sum()))
+    if chosen is not None and marching_u is not None:
+        found = march(kit, receiver, position, kind, index, light, chosen, marching_u)
+        if not smooth:
+            return jnp.zeros_like(found[0]), *found, jnp.zeros_like(found[0])
+        once, more = once + found[0], more + found[1]
+    return direct, once, more, lost
+
+
+@jax.jit
+def _split(once, more, by_table, dropped):
+    shape = by_table.shape + (1,) * (once.ndim - 1)
+    by_table, dropped = by_table.reshape(shape), dropped.reshape(shape)
+    return jnp.where(by_table, once, 0.0), jnp.where(by_table, more, 0.0), jnp.where(dropped, once, 0.0)
+
+
+def delta_arrivals(kit: Kit, receiver: Receiver, position: ArrayLike, tally: Tally) -> tuple[Array, Array, Array, Array]:
+    """Light of all point, spot and directional lights at the receivers, but for marched segments: no noise. As `light_from`."""
+    shape = jax.eval_shape(receiver.straight, receiver.normal, receiver.normal).shape
+    total = [jnp.zeros(shape, jnp.float32)] * 4
     unused = (jnp.zeros(position.shape[0], jnp.float32),) * 4
     for kind, i in delta_lights(kit.scene):
         index = jnp.full(position.shape[0], i, jnp.int32)
-        found = light_from(kit, position, normal, kind, index, unused)
+        found = light_from(kit, receiver, position, kind, index, unused, own=True, tally=tally)
         total = [a + b for a, b in zip(total, found, strict=True)]
     return tuple(total)
 
 
-def sampled_arrivals(kit: Kit, position, normal, item, sample, seed, depth: int, *, with_delta: bool):
-    """One random emitter of each kind at each receiver. As `light_from`, summed."""
-    total = [jnp.zeros(position.shape, jnp.float32)] * 4
-    counts = {kind: sum(k == kind for k, _ in delta_lights(kit.scene)) for kind in DELTA} if with_delta else {}
-    kinds = [kind for kind, count in counts.items() if count]
+def sampled_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, depth: int, *, tally: Tally):
+    """One random emitter of each kind at each receiver, as `light_from`, summed.
+
+    At depth 0 delta lights send what is marched only: `delta_arrivals` has the rest.
+    """
+    shape = jax.eval_shape(receiver.straight, receiver.normal, receiver.normal).shape
+    total = [jnp.zeros(shape, jnp.float32)] * 4
+    own = depth == 0
+    counts = {kind: sum(k == kind for k, _ in delta_lights(kit.scene)) for kind in DELTA}
+    kinds = [kind for kind, count in counts.items() if count and (not own or kit.marches)]
     kinds += ["area"] if kit.scene.area_lights is not None else []
     kinds += ["environment"] if kit.scene.environment is not None else []
     for number, kind in enumerate(kinds):
         u = sampling.uniforms(seed, _STREAM, item, 8 * depth + number, sample)
+        again = sampling.uniforms(seed, _MARCHED, item, number, sample) if own and kit.marches else None
+        pick = sampling.uniforms(seed, _PICK, item, 8 * depth + number, sample)[:2]
         count = counts.get(kind, 1)
         index = jnp.minimum((u[3] * count).astype(jnp.int32), count - 1)
-        found = light_from(kit, position, normal, kind, index, u)
+        smooth = not (own and kind in DELTA)
+        found = light_from(
+            kit, receiver, position, kind, index, u, own=own, tally=tally, marching_u=again, pick=pick, smooth=smooth
+        )
         total = [a + count * b for a, b in zip(total, found, strict=True)]
     return tuple(total)
 
 
-def path_arrivals(kit: Kit, position, normal, item, sample, seed) -> dict[str, Array]:
-    """One path from each receiver: irradiance by layer without the delta lights' own (`delta_arrivals`).
+def _step(kit, receiver, position, item, sample, seed, depth, tally):
+    """The next vertex: (what the receiver makes of a unit of its irradiance, the unscattered part, position, normal)."""
+    normal, mesh = receiver.normal, kit.scene.mesh
+    arguments = (item, sample, seed, jnp.int32(depth), kit.probe_sigma)
+    proposal = surface_paths.propose(mesh, kit.faces, position, normal, *arguments, shares=kit.shares)
+    t, face = ray_casting.intersect(kit.caster, proposal.origin, proposal.direction, proposal.t_max)
+    t, face = jnp.asarray(t), jnp.asarray(face)
+    arrival = surface_paths.arrive(mesh, kit.faces, position, normal, proposal, t, face, kit.probe_sigma)
+    visible = plumb = np.ones(item.shape, bool)
+    if kit.shares[0] < 1:  # otherwise the ray itself is the proof
+        visible = ~_occluded(kit, *_shortened(*arrival.between))
+        plumb = ~_occluded(kit, *arrival.plumb)
+    tau = thickness(kit, position, arrival.direction, arrival.distance)
+    chosen = response = None
+    if depth == 1 and kit.marches:
+        light = Light(arrival.direction, arrival.distance, jnp.ones_like(position), arrival.normal)
+        sight = visible | np.asarray(proposal.technique == 0)
+        chosen = by_marching(kit, position, normal, light, sight) & np.asarray(arrival.valid)
+        u = sampling.uniforms(seed, _MARCHED, item, 100, sample)
+        once, more = march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, u)
+        response = once + more
+        tally.count(segments=chosen.size, marched=int(chosen.sum()))
+    if kit.responses is not None:
+        by_table = np.asarray(arrival.valid) & visible
+        beyond, lookups = _beyond(kit.responses, tau, jnp.asarray(by_table))
+        tally.count(beyond=beyond, lookups=lookups)
+    step, plain = surface_paths.transport(
+        mesh,
+        kit.faces,
+        kit.responses,
+        receiver,
+        proposal,
+        arrival,
+        jnp.asarray(visible),
+        jnp.asarray(plumb),
+        tau,
+        kit.probe_sigma,
+        None if chosen is None else jnp.asarray(chosen),
+        response,
+        shares=kit.shares,
+        image=kit.image,
+    )
+    return step, plain, arrival.position, arrival.normal
+
+
+def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, tally: Tally) -> dict[str, Array]:
+    """One path from each receiver: what it makes of light, by layer, without `delta_arrivals`.
 
     Keys as the layers of the light that the receiver reflects, and `occluded`, the scattered light that was dropped.
     """
-    direct, once, more, lost = sampled_arrivals(kit, position, normal, item, sample, seed, 0, with_delta=False)
+    direct, once, more, lost = sampled_arrivals(kit, receiver, position, item, sample, seed, 0, tally=tally)
     layers = {
         "surface_from_light": direct,
         "surface_from_surface": jnp.zeros_like(direct),
@@ -186,52 +330,50 @@ def path_arrivals(kit: Kit, position, normal, item, sample, seed) -> dict[str, A
         "surface_from_multiple": more,
         "occluded": lost,
     }
-    whole = plain = jnp.ones_like(direct)
+    kinds = (kit.scene.area_lights is not None) + (kit.scene.environment is not None)
+    tally.count(traced=kinds * item.size)
+    kinds += len({kind for kind, _ in delta_lights(kit.scene)})
+    whole = plain = rest = None
     for depth in range(1, kit.max_bounces + 1):
-        arguments = (item, sample, seed, jnp.int32(depth), kit.probe_sigma)
-        proposal = surface_paths.propose(kit.scene.mesh, kit.faces, position, normal, *arguments, shares=kit.shares)
-        t, face = ray_casting.intersect(kit.caster, proposal.origin, proposal.direction, proposal.t_max)
-        arrival = surface_paths.arrive(
-            kit.scene.mesh, kit.faces, position, normal, proposal, jnp.asarray(t), jnp.asarray(face), kit.probe_sigma
-        )
-        visible = plumb = jnp.ones(item.shape, bool)
-        if kit.shares[0] < 1:  # otherwise the ray itself is the proof
-            origin, direction, length = arrival.between
-            visible = ~ray_casting.occluded(kit.caster, origin, direction, length * (1 - 1e-5))
-            plumb = ~ray_casting.occluded(kit.caster, *arrival.plumb)
-        tau = thickness(kit, position, arrival.direction, arrival.distance)
-        step, unscattered = surface_paths.transport(
-            kit.scene.mesh,
-            kit.faces,
-            kit.responses,
-            normal,
-            proposal,
-            arrival,
-            jnp.asarray(visible),
-            jnp.asarray(plumb),
-            tau,
-            kit.probe_sigma,
-            shares=kit.shares,
-            image=kit.image,
-        )
-        whole, plain = _survive(whole * step, plain * unscattered, item, sample, seed, jnp.int32(depth))
-        position, normal = arrival.position, arrival.normal
-        found = sampled_arrivals(kit, position, normal, item, sample, seed, depth, with_delta=True)
-        all_of_it = whole * (found[0] + found[1] + found[2])
+        step, unscattered, position, normal = _step(kit, receiver, position, item, sample, seed, depth, tally)
         if depth == 1:
-            layers["surface_from_surface"] = plain * found[0]
-            all_of_it = all_of_it - plain * found[0]
-        layers["surface_from_multiple"] = layers["surface_from_multiple"] + all_of_it
-        if not bool(jnp.any(whole > 0)):
+            whole, plain, rest = step, unscattered, jnp.ones_like(position)
+        else:
+            rest = rest * step
+        if depth > 2:
+            rest = _survive(whole, rest, item, sample, seed, jnp.int32(depth))
+        receiver = Irradiance(normal)
+        found = sampled_arrivals(kit, receiver, position, item, sample, seed, depth, tally=tally)
+        first, several = _collect(whole, plain if depth == 1 else None, rest, found)
+        if first is not None:
+            layers["surface_from_surface"] = first
+        layers["surface_from_multiple"] = layers["surface_from_multiple"] + several
+        alive = int(_count_alive(whole, rest))
+        tally.count(traced=(1 + kinds) * alive)
+        if alive == 0:
             break
     return layers
 
 
 @jax.jit
-def _survive(whole, plain, item, sample, seed, depth):
+def _count_alive(whole, rest):
+    return jnp.sum(jnp.any((rest != 0) & (first_row(whole) != 0), axis=-1))
+
+
+@jax.jit
+def _collect(whole, plain, rest, found):
+    """Light of one vertex at the receiver: (from one surface alone or None, the rest)."""
+    arriving = rest * (found[0] + found[1] + found[2])
+    everything = whole * like(arriving, whole)
+    if plain is None:
+        return None, everything
+    first = plain * like(rest * found[0], plain)
+    return first, everything - first
+
+
+@jax.jit
+def _survive(whole, rest, item, sample, seed, depth):
     """Russian roulette from the third vertex on; paths that lost end with weight 0."""
     u = sampling.uniforms(seed, _STREAM, item, 1000 + depth, sample)[0]
-    chance = jnp.clip(jnp.max(jnp.abs(whole), axis=-1), 0.1, 1.0)
-    chance = jnp.where(depth < 3, 1.0, chance)
-    kept = jnp.where(u < chance, 1 / chance, 0.0)[:, None]
-    return whole * kept, plain * kept
+    chance = jnp.clip(jnp.max(jnp.abs(first_row(whole) * rest), axis=-1), 0.1, 1.0)
+    return rest * jnp.where(u < chance, 1 / chance, 0.0)[:, None]

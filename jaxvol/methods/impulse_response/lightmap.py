@@ -72,25 +72,23 @@ def vertices(mesh: Mesh) -> Vertices:
     )
 
 
-def unwrap(mesh: Mesh, *, resolution: int, padding: int = 2) -> Lightmap:
+def unwrap(mesh: Mesh, *, resolution: int, padding: int = 2, uv: Float[np.ndarray, "F 3 2"] | None = None) -> Lightmap:
     """A lightmap of about `resolution` texels a side, charts `padding` texels apart; front sides.
 
-    Raises ValueError for a resolution out of range, where no face has an area, or where charts do not fit one atlas.
+    `uv` are the mesh's own lightmap coordinates by corner, 0..1 and v upward, then exactly `resolution` texels a side; None
+    unwraps the mesh. Raises ValueError for a resolution out of range, where no face has an area, where charts do not fit one
+    atlas, and for coordinates that are not finite, out of range, collapsed or overlapping.
     """
     if not 16 <= resolution <= 8192:
         raise ValueError(f"resolution: {resolution} is not allowed, must be 16 to 8192")
     faces, normals, numbers = _sound_faces(mesh)
     vertex = np.asarray(mesh.vertices, np.float32)
-    atlas = xatlas.Atlas()
-    atlas.add_mesh(vertex, faces.astype(np.uint32))
-    options = xatlas.PackOptions()
-    options.resolution, options.padding, options.create_image = resolution, padding, False
-    atlas.generate(pack_options=options)
-    if atlas.atlas_count != 1 or atlas.width == 0:
-        raise ValueError(f"mesh does not fit one lightmap of {resolution} texels ({atlas.atlas_count} would be needed)")
-    original, indices, uv = atlas[0]
-    width, height = int(atlas.width), int(atlas.height)
-    indices = indices.astype(np.int64)
+    if uv is None:
+        original, indices, uv, width, height = _charts(vertex, faces, resolution, padding)
+    else:
+        original, indices, uv = _given_charts(faces, np.asarray(uv, np.float64)[numbers])
+        width = height = resolution
+        _refuse_overlap(indices, uv, resolution)
     owner = _owners(indices, uv, width, height)
     covered = owner >= 0
     rows, columns = np.nonzero(covered)
@@ -110,6 +108,41 @@ def unwrap(mesh: Mesh, *, resolution: int, padding: int = 2) -> Lightmap:
     )
 
 
+def _charts(vertex, faces, resolution, padding):
+    """Vertices' origins, faces, coordinates and size of an atlas by xatlas."""
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(vertex, faces.astype(np.uint32))
+    options = xatlas.PackOptions()
+    options.resolution, options.padding, options.create_image = resolution, padding, False
+    atlas.generate(pack_options=options)
+    if atlas.atlas_count != 1 or atlas.width == 0:
+        raise ValueError(f"mesh does not fit one lightmap of {resolution} texels ({atlas.atlas_count} would be needed)")
+    original, indices, uv = atlas[0]
+    return original, indices.astype(np.int64), uv, int(atlas.width), int(atlas.height)
+
+
+def _given_charts(faces, uv):
+    """The same for coordinates [F, 3, 2] of the faces' corners: every corner is a vertex of its own."""
+    if uv.shape != (len(faces), 3, 2) or not np.all(np.isfinite(uv)):
+        raise ValueError(f"uv: must be finite and of shape [faces, 3, 2], got {uv.shape}")
+    if uv.min() < 0 or uv.max() > 1:
+        raise ValueError(f"uv: {uv.min():g} to {uv.max():g} is not allowed, must be 0 to 1")
+    one, two = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    collapsed = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]) < 1e-12
+    if collapsed.any():
+        raise ValueError(f"uv: {collapsed.sum()} faces with an area have none in the lightmap, face {collapsed.argmax()} first")
+    return faces.reshape(-1), np.arange(3 * len(faces)).reshape(-1, 3), uv.reshape(-1, 2)
+
+
+def _refuse_overlap(indices, uv, resolution):
+    """ValueError where two faces claim the inside of one texel's centre."""
+    whole = _owners(indices, uv, resolution, resolution, margin=1e-6)
+    again = _owners(indices[::-1], uv, resolution, resolution, margin=1e-6)
+    twice = (whole >= 0) & (whole != len(indices) - 1 - again)
+    if twice.any():
+        raise ValueError(f"uv: faces overlap in {twice.sum()} texels of {resolution} x {resolution}")
+
+
 def _barycentric(corners, point):
     """Weights of a point in triangles [n, 3, 2]."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
@@ -121,7 +154,7 @@ def _barycentric(corners, point):
     return np.stack([1 - wb - wc, wb, wc], axis=1)
 
 
-def _owners(indices, uv, width, height):
+def _owners(indices, uv, width, height, *, margin=-1e-9):
     """The face whose chart holds each texel's centre, -1 for none; row 0 is the top."""
     owner = np.full((height, width), -1, np.int64)
     size = np.array([width, height])
@@ -133,7 +166,7 @@ def _owners(indices, uv, width, height):
         x, y = x.ravel(), y.ravel()
         centre = np.stack([(x + 0.5) / width, (y + 0.5) / height], axis=1)
         weight = _barycentric(np.broadcast_to(corners, (len(x), 3, 2)), centre)
-        inside = np.all(weight >= -1e-9, axis=1)
+        inside = np.all(weight >= margin, axis=1)
         owner[height - 1 - y[inside], x[inside]] = face
     return owner
 

@@ -2,8 +2,10 @@
 
 `prepare` contracts the Chebyshev tables for a medium's albedo, g and phase moments, channel by channel, onto grids that are
 uniform in tau^(1/4) and, for area emitters, in sign(pi/2 - theta_n) |theta_n / (pi/2) - 1|^(1/2): the variables in which the
-tables are smooth. A query interpolates linearly and puts the exponentials back. With tau the optical thickness of the
-segment and d its length, the effective sigma_t is tau / d (section 4.4: the mean along the segment), sigma_s = albedo tau / d:
+tables are smooth. A query interpolates linearly and puts the exponentials back; inside random paths it may instead take one
+node, drawn with the weights of the interpolation, which has the same mean for a quarter of the cost. With tau the optical
+thickness of the segment and d its length, the effective sigma_t is tau / d (section 4.4: the mean along the segment),
+sigma_s = albedo tau / d:
 
     point, area:  L_l = albedo tau / d^2 { e^-tau S_l(tau) + albedo tau G_l(tau) }     for I0 = 1 or Le dA = 1
     directional:  L_l = albedo e^-tau S_l(tau) + albedo^2 G_l(tau)                     for E0 = 1
@@ -23,12 +25,13 @@ from jaxtyping import Array, Float
 from jaxvol import media, zonal_lookup
 from jaxvol.types import Medium
 
+Pick = tuple[Float[Array, "*b"], Float[Array, "*b"]]
+
 
 class ResponseGrid(eqx.Module):
     """One emitter's response in one channel; emitters without an angle have one node of it."""
 
-    single: Float[Array, "tau angle bands"]  # S
-    multiple: Float[Array, "tau angle bands"] | None  # G e^{kappa tau}
+    rows: Float[Array, "tau angle sets"]  # S, and behind it G e^{kappa tau} where light is scattered more than once
     kappa: Float[Array, ""] | None  # slowest decay of G per unit of tau
     quarter_max: Float[Array, ""]  # tau^(1/4) at the last node
     multiple_max: Float[Array, ""]  # tau beyond which G is an exponential
@@ -50,13 +53,16 @@ def prepare(
     *,
     grey: bool,
     multiple: bool,
+    similarity: bool = False,
+    g_range: float | None = None,
     num_tau: int = 192,
     num_angle: int = 33,
 ) -> Responses:
     """Resample the tables for a medium's phase function and albedo; `grey` shares one channel among three.
 
-    Linear interpolation costs at most 4e-4 of band 0 with the default nodes (tests/methods/impulse_response). Raises ValueError
-    where the tables lack an emitter or, with `multiple`, the infinite sum.
+    `similarity` and `g_range` are the paper's modes (`zonal_lookup.medium_response`). Linear interpolation costs at most
+    4e-4 of band 0 with the default nodes (tests/methods/impulse_response). Raises ValueError where the tables lack an emitter
+    or, with `multiple`, the infinite sum.
     """
     for kind in ("point", "directional", "area"):
         table = getattr(tables, kind)
@@ -64,25 +70,27 @@ def prepare(
             raise ValueError(f"the table file lacks the emitter {kind!r}; baking needs point, directional and area")
         if multiple and table.multiple is None:
             raise ValueError(f"the table file has no multiple scattering of {kind!r}; set scattering = 'single'")
-    return _prepare(tables, medium, grey=grey, multiple=multiple, num_tau=num_tau, num_angle=num_angle)
+    mode = "similarity" if similarity else "table"
+    return _prepare(tables, medium, g_range, grey=grey, multiple=multiple, mode=mode, num_tau=num_tau, num_angle=num_angle)
 
 
-@partial(jax.jit, static_argnames=("grey", "multiple", "num_tau", "num_angle"))
-def _prepare(tables, medium, *, grey, multiple, num_tau, num_angle):
+@partial(jax.jit, static_argnames=("grey", "multiple", "mode", "num_tau", "num_angle"))
+def _prepare(tables, medium, g_range, *, grey, multiple, mode, num_tau, num_angle):
     albedo = media.single_scattering_albedo(medium)
     moments = None if medium.phase is None else medium.phase.moments
     g = medium.g if medium.phase is None else medium.phase.moments[1]
+    options = {"moments": moments, "g": g, "g_range": g_range, "mode": mode}
     channels = 1 if grey else 3
     grids = {}
     for kind in ("point", "directional", "area"):
         angles = num_angle if kind == "area" else 1
-        make = partial(_grid, tables, kind, moments=moments, g=g, multiple=multiple, num_tau=num_tau, num_angle=angles)
+        make = partial(_grid, tables, kind, **options, multiple=multiple, num_tau=num_tau, num_angle=angles)
         grids[kind] = tuple(make(albedo=albedo[i]) for i in range(channels))
     return Responses(**grids, albedo=albedo, transport=1 - albedo * g)
 
 
-def _grid(tables, kind, *, moments, g, albedo, multiple, num_tau, num_angle):
-    response = zonal_lookup.medium_response(tables, kind, moments=moments, g=g, albedo=albedo)
+def _grid(tables, kind, *, moments, g, albedo, g_range, mode, multiple, num_tau, num_angle):
+    response = zonal_lookup.medium_response(tables, kind, moments=moments, g=g, albedo=albedo, g_range=g_range, multiple=mode)
     dtype = response.single.dtype
     last = jnp.sqrt(jnp.sqrt(response.single_range[1]))
     quarter = jnp.linspace(0, 1, num_tau, dtype=dtype) * last
@@ -97,27 +105,32 @@ def _grid(tables, kind, *, moments, g, albedo, multiple, num_tau, num_angle):
         tau, theta = tau[:, None], None
         once = zonal_lookup.scaled_single(response, tau)
     if not multiple:
-        return ResponseGrid(once, None, None, last, response.single_range[1])
-    limit = response.multiple_range[1]
+        return ResponseGrid(once, None, last, response.single_range[1])
+    scale = 1.0 if response.tau_scale is None else response.tau_scale  # the similar medium's tau per tau
+    limit, kappa = response.multiple_range[1] / scale, response.kappa * scale
     more = zonal_lookup.scaled_multiple(response, jnp.minimum(tau, limit), theta_n=theta)
-    more = more * jnp.exp(response.kappa * jnp.minimum(tau, limit))[..., None]
-    return ResponseGrid(once, more, response.kappa, last, limit)
+    more = more * jnp.exp(kappa * jnp.minimum(tau, limit))[..., None]
+    return ResponseGrid(jnp.concatenate([once, more], axis=-1), kappa, last, limit)
 
 
-def _nodes(grid: ResponseGrid, tau, angle):
-    """Flat indices and weights of the two or four nodes about a query."""
-    num_tau, num_angle, _ = grid.single.shape
+def _nodes(grid: ResponseGrid, tau, angle, pick):
+    """Flat indices and weights of the two or four nodes about a query; with `pick` one of them, drawn by its weight."""
+    num_tau, num_angle, _ = grid.rows.shape
     positive = tau > 1e-12
     quarter = jnp.where(positive, jnp.sqrt(jnp.sqrt(jnp.where(positive, tau, 1))), 0)
     x = jnp.minimum(quarter / grid.quarter_max, 1) * (num_tau - 1)
     i = jnp.clip(x.astype(jnp.int32), 0, num_tau - 2)
     f = x - i
+    if pick is not None:
+        i = i + (pick[0] < f)
     if num_angle == 1:
-        return ((i, 1 - f), (i + 1, f))
+        return ((i, 1),) if pick is not None else ((i, 1 - f), (i + 1, f))
     y = jnp.clip(angle * 0.5 + 0.5, 0, 1) * (num_angle - 1)
     j = jnp.clip(y.astype(jnp.int32), 0, num_angle - 2)
     h = y - j
     row = i * num_angle + j
+    if pick is not None:
+        return ((row + (pick[1] < h), 1),)
     return (
         (row, (1 - f) * (1 - h)),
         (row + 1, (1 - f) * h),
@@ -126,9 +139,15 @@ def _nodes(grid: ResponseGrid, tau, angle):
     )
 
 
-def _interpolate(values, nodes):
-    flat = values.reshape(-1, values.shape[-1])
-    return sum(flat[index] * weight[..., None] for index, weight in nodes)
+def _interpolate(grid, nodes):
+    """(S, G e^{kappa tau} or None) at the nodes."""
+    flat = grid.rows.reshape(-1, grid.rows.shape[-1])
+    found = [flat[index] if isinstance(weight, int) else flat[index] * weight[..., None] for index, weight in nodes]
+    values = sum(found[1:], found[0])
+    if grid.kappa is None:
+        return values, None
+    bands = values.shape[-1] // 2
+    return values[..., :bands], values[..., bands:]
 
 
 def angle_variable(cos_n: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -144,37 +163,41 @@ def compact_source(
     tau: Float[Array, "*b 3"],
     distance: Float[Array, "*b 3"],
     cos_n: Float[Array, "*b 3"] | None,
+    *,
+    pick: Pick | None = None,
 ) -> tuple[Float[Array, "*b C bands"], Float[Array, "*b C bands"] | None]:
     """Incident radiance of a point (cos_n None) or patch with I0 or Le dA = 1: (scattered once, twice or more or None).
 
     Per channel C of the grids. tau is the optical thickness of the segment, distance > 0 its length (which image sources make
-    another one in each channel). Beyond the table's tau the response falls like e^{-kappa tau} / tau.
+    another one in each channel), `pick` random numbers that choose a single node. Beyond the table's tau the response falls
+    like e^{-kappa tau} / tau.
     """
     once, more = [], []
     for channel, grid in enumerate(grids):
         t, d = tau[..., channel], distance[..., channel]
-        nodes = _nodes(grid, t, None if cos_n is None else angle_variable(cos_n[..., channel]))
+        nodes = _nodes(grid, t, None if cos_n is None else angle_variable(cos_n[..., channel]), pick)
+        first, rest = _interpolate(grid, nodes)
         scale = albedo[channel] * t / (d * d)
         table_end = grid.quarter_max * grid.quarter_max * grid.quarter_max * grid.quarter_max
         spread = jnp.minimum(1, table_end / jnp.maximum(t, 1e-12))
-        once.append((scale * spread * jnp.exp(-t))[..., None] * _interpolate(grid.single, nodes))
-        if grid.multiple is not None:
+        once.append((scale * spread * jnp.exp(-t))[..., None] * first)
+        if rest is not None:
             past = jnp.minimum(1, grid.multiple_max / jnp.maximum(t, 1e-12))
             factor = scale * albedo[channel] * t * past * jnp.exp(-grid.kappa * t)
-            more.append(factor[..., None] * _interpolate(grid.multiple, nodes))
+            more.append(factor[..., None] * rest)
     return jnp.stack(once, axis=-2), jnp.stack(more, axis=-2) if more else None
 
 
 def directional_source(
-    grids: tuple[ResponseGrid, ...], albedo: Float[Array, "3"], tau: Float[Array, "*b 3"]
+    grids: tuple[ResponseGrid, ...], albedo: Float[Array, "3"], tau: Float[Array, "*b 3"], *, pick: Pick | None = None
 ) -> tuple[Float[Array, "*b C bands"], Float[Array, "*b C bands"] | None]:
     """Incident radiance of a directional light of irradiance 1 at optical depth tau of a half-space lit straight down."""
     once, more = [], []
     for channel, grid in enumerate(grids):
         t = tau[..., channel]
-        nodes = _nodes(grid, t, None)
-        once.append((albedo[channel] * jnp.exp(-t))[..., None] * _interpolate(grid.single, nodes))
-        if grid.multiple is not None:
+        first, rest = _interpolate(grid, _nodes(grid, t, None, pick))
+        once.append((albedo[channel] * jnp.exp(-t))[..., None] * first)
+        if rest is not None:
             factor = albedo[channel] * albedo[channel] * jnp.exp(-grid.kappa * t)
-            more.append(factor[..., None] * _interpolate(grid.multiple, nodes))
+            more.append(factor[..., None] * rest)
     return jnp.stack(once, axis=-2), jnp.stack(more, axis=-2) if more else None

@@ -12,7 +12,9 @@ from jaxvol.methods.impulse_response import gather, lookup, surface_paths
 from jaxvol.types import Camera, Medium, Scene
 
 Scattering = Literal["surface", "attenuated", "single", "multiple"]
+Occlusion = Literal["march", "drop"]
 _MODES = ("surface", "attenuated", "single", "multiple")
+CONTRAST = 0.5  # of density along a segment, above which it is marched
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,12 @@ class Plan:
     scattering: str  # what of the medium is baked
     grey: bool
     image: bool
+    march_occluded: bool  # segments that an occluder cuts are integrated, not dropped
+    contrast: float | None  # of density, above which a segment is integrated; None = never
+    similarity: bool
+    g_range: float | None
+    harmonics: bool  # incident SH beside irradiance
+    open: bool  # nothing occludes anything
     max_bounces: int
     shares: tuple[float, float, float]  # of cosine rays, probes and area points among next vertices
     probe_sigma: float
@@ -33,20 +41,22 @@ class Plan:
 
 def claims(scene: Scene) -> tuple[Claim, ...]:
     """The four surface layers; partial where paths of their class are known to be missing."""
-    missing = []
-    if scene.medium is not None and not media.is_empty(scene.medium):
+    once, more = [], []  # missing from light scattered once, and from light scattered more often
+    medium = scene.medium
+    if medium is not None and not media.is_empty(medium):
         if scene.mesh is not None and not _flat(scene.mesh):
-            missing.append("light that scatters around occluders is dropped")
+            if segments.is_box(medium):
+                more.append("light scattered more than once around occluders has its last leg alone traced")
+            else:
+                once.append("light that scatters around occluders is dropped")
         if scene.spot_lights is not None:
-            missing.append("light scattered out of a spot's cone reaches only receivers inside the cone")
-        if scene.medium.inclusions:
-            missing.append("inclusions scatter with the outer medium's albedo and phase function")
+            once.append("light scattered out of a spot's cone reaches only receivers inside the cone")
+        if medium.inclusions:
+            once.append("inclusions scatter with the outer medium's albedo and phase function")
     glossy = scene.mesh is not None and scene.mesh.specular is not None
-    scattered = "; ".join([*missing, *(["Phong lobes are left out"] if glossy else [])]) or None
-    plain = "Phong lobes are left out" if glossy else None
-    return tuple(
-        Claim((name,), plain if name in ("surface_from_light", "surface_from_surface") else scattered) for name in SURFACE
-    )
+    lobes = ["Phong lobes count as Lambertian after the first surface"] if glossy else []
+    partial = {"surface_from_light": [], "surface_from_surface": lobes, "surface_from_volume": once}
+    return tuple(Claim((name,), "; ".join(partial.get(name, [*once, *more, *lobes])) or None) for name in SURFACE)
 
 
 def _flat(mesh) -> bool:
@@ -64,6 +74,11 @@ def plan(
     scattering: Scattering = "multiple",
     image: bool = True,
     back_scattering: bool = True,
+    occlusion: Occlusion = "march",
+    contrast: float | None = CONTRAST,
+    similarity: bool = False,
+    g_range: float | None = None,
+    harmonics: bool = False,
     max_bounces: int = 6,
     num_lanes: int = 1 << 14,
     caster: str = "auto",
@@ -75,6 +90,13 @@ def plan(
             light scattered once or however often.
         image: subtract the image source behind receivers (multiple scattering); False is the paper's mode.
         back_scattering: also find patches beside and behind receivers; False follows cosine rays alone.
+        occlusion: "march" integrates the light that scatters around an occluder between a receiver and an emitter, last
+            leg by last leg; "drop" is the paper's rule, and its share is reported.
+        contrast: of density about a receiver's segment, (max - min) / max, above which it is integrated with marched sigma;
+            None = never, the paper's mode.
+        similarity: the paper's map of light scattered twice or more to an isotropic medium.
+        g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
+        harmonics: also bake SH of incident radiance.
         max_bounces: surface vertices after the receiver; 0 bakes the emitters' own light.
         num_lanes: paths traced together, at most.
 
@@ -84,6 +106,12 @@ def plan(
         raise ValueError(f"scattering: {scattering!r} is not allowed, must be one of {', '.join(_MODES)}")
     if not 0 <= max_bounces <= 64:
         raise ValueError(f"max_bounces: {max_bounces} is not allowed, must be 0 to 64")
+    if occlusion not in ("march", "drop"):
+        raise ValueError(f"occlusion: {occlusion!r} is not allowed, must be march or drop")
+    if contrast is not None and not 0 <= contrast <= 1:
+        raise ValueError(f"contrast: {contrast} is not allowed, must be 0 to 1")
+    if g_range is not None and not 0 < g_range < 1:
+        raise ValueError(f"g_range: {g_range} is not allowed, must lie in (0, 1)")
     if num_lanes < 1:
         raise ValueError(f"num_lanes: {num_lanes} is not allowed, must be >= 1")
     if scene.mesh is None or scene.mesh.faces.shape[0] == 0:
@@ -108,6 +136,17 @@ def plan(
         skipped.append("grey medium: one channel of tables serves all three")
     if scatters and scattering == "single":
         skipped.append("light scattered twice or more (scattering = 'single')")
+    if g_range is not None and medium is not None and medium.phase is not None:
+        raise ValueError("g_range: interpolates in g, and this medium has a phase table")
+    bare = _flat(scene.mesh)
+    heterogeneous = scatters and medium.density is not None
+    if scatters and bare:
+        skipped.append("all faces lie in one plane: no occluders are looked for")
+    if heterogeneous and not segments.is_box(medium):
+        skipped.append("contrast is not measured in media with boundaries or inclusions: their mean serves")
+        heterogeneous = False
+    if scatters and not heterogeneous:
+        skipped.append("no density varies along segments: none is marched for its contrast")
     if not (scatters and back_scattering):
         skipped.append("no probes for back-scattering: next vertices by cosine-distributed rays alone")
     if medium is not None and medium.density is None and segments.is_box(medium):
@@ -116,6 +155,12 @@ def plan(
         scattering=scattering,
         grey=grey,
         image=image and scattering == "multiple",
+        march_occluded=scatters and occlusion == "march" and not bare and segments.is_box(medium),
+        contrast=contrast if heterogeneous else None,
+        similarity=similarity,
+        g_range=g_range,
+        harmonics=harmonics,
+        open=bare,
         max_bounces=max_bounces,
         shares=(0.6, 0.25, 0.15) if scatters and back_scattering else (1.0, 0.0, 0.0),
         probe_sigma=_probe_sigma(medium),
@@ -153,7 +198,14 @@ def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTable
     responses = None
     if plan.scattering in ("single", "multiple"):
         found = tables.default_file().lookups() if responses_from is None else responses_from
-        responses = lookup.prepare(found, medium, grey=plan.grey, multiple=plan.scattering == "multiple")
+        responses = lookup.prepare(
+            found,
+            medium,
+            grey=plan.grey,
+            multiple=plan.scattering == "multiple",
+            similarity=plan.similarity,
+            g_range=plan.g_range,
+        )
     bare = Scene(**{**{name: getattr(scene, name) for name in Scene.__dataclass_fields__}, "medium": medium})
     return gather.Kit(
         scene=bare,
@@ -167,4 +219,8 @@ def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTable
         num_steps=plan.num_steps,
         max_bounces=plan.max_bounces,
         shares=plan.shares,
+        march_occluded=plan.march_occluded,
+        contrast=plan.contrast,
+        multiple=plan.scattering == "multiple",
+        open=plan.open,
     )

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvol import camera as cameras
-from jaxvol import first_hit, sampling, zonal_lookup
+from jaxvol import first_hit, materials, sampling, zonal_lookup
 from jaxvol.layers import SURFACE, from_items
 from jaxvol.methods.impulse_response import estimate, gather, planning
 from jaxvol.methods.impulse_response.planning import Plan
+from jaxvol.methods.impulse_response.receivers import Irradiance, Reflection
 from jaxvol.types import Camera, Estimate, Rays, Scene
 
 _STREAM = sampling.stream("impulse_response.pixels")
@@ -33,6 +34,7 @@ def render(
     if samples < 1:
         raise ValueError(f"samples: {samples} is not allowed, must be >= 1")
     kit = planning.prepare(scene, plan, responses_from=tables)
+    tally = gather.Tally()
     total = camera.height * camera.width
     lanes = estimate.lanes_for(total, plan.num_lanes)
     mean = {name: np.zeros((total, 3)) for name in SURFACE}
@@ -40,7 +42,7 @@ def render(
     for sample in range(samples):
         for first in range(0, total, lanes):
             pixel = jnp.minimum(first + jnp.arange(lanes), total - 1)
-            found = _one_sample(kit, camera, pixel, jnp.full(lanes, sample, jnp.int32), jnp.uint32(seed))
+            found = _one_sample(kit, camera, pixel, jnp.full(lanes, sample, jnp.int32), jnp.uint32(seed), tally)
             rows = slice(first, min(first + lanes, total))
             for name, value in found.items():
                 value = np.asarray(value, np.float64)[: total - first]
@@ -67,26 +69,35 @@ def _pixel_rays(camera, pixel, sample, seed):
 
 
 @jax.jit
-def _facing(normal, direction, valid):
-    side = jnp.where(sampling.dot(normal, direction) > 0, -1.0, 1.0)
-    return jnp.where(valid[:, None], normal * side[:, None], normal)
+def _receiver(mesh, hits, direction):
+    """The surfaces as the eye sees them, on its side."""
+    side = jnp.where(sampling.dot(hits.normal, direction) > 0, -1.0, 1.0)
+    normal = jnp.where(hits.valid[:, None], hits.normal * side[:, None], -direction)
+    if mesh.specular is None:
+        return Irradiance(normal)
+    surface = materials.surface_at(mesh, hits.face)
+    mirrored = materials.mirror(normal, direction)
+    return Reflection(normal, mirrored, surface.albedo, surface.specular, surface.exponent)
 
 
 @jax.jit
 def _reflect(mesh, face, valid, through, layers):
-    albedo = jnp.where(valid[:, None], mesh.albedo[jnp.maximum(face, 0)], 0.0) / jnp.pi
-    weight = albedo if through is None else albedo * through
+    weight = jnp.where(valid, 1.0, 0.0)[:, None]
+    if mesh.specular is None:
+        weight = weight * mesh.albedo[jnp.maximum(face, 0)] / jnp.pi
+    if through is not None:
+        weight = weight * through
     return {name: weight * value for name, value in layers.items()}
 
 
-def _one_sample(kit: gather.Kit, camera, pixel, sample, seed):
+def _one_sample(kit: gather.Kit, camera, pixel, sample, seed, tally):
     rays: Rays = _pixel_rays(camera, pixel, sample, seed)
     hits = first_hit.first_hits(kit.scene, rays, kit.caster)
-    normal = _facing(hits.normal, rays.direction, hits.valid)
-    direct, once, more, _ = gather.delta_arrivals(kit, hits.position, normal)
+    receiver = _receiver(kit.scene.mesh, hits, rays.direction)
+    direct, once, more, _ = gather.delta_arrivals(kit, receiver, hits.position, tally)
     layers = {name: jnp.zeros_like(direct) for name in SURFACE}
     if estimate.needs_paths(kit):
-        found = gather.path_arrivals(kit, hits.position, normal, pixel, sample, seed)
+        found = gather.path_arrivals(kit, receiver, hits.position, pixel, sample, seed, tally)
         layers = {name: found[name] for name in SURFACE}
     for name, value in (("surface_from_light", direct), ("surface_from_volume", once), ("surface_from_multiple", more)):
         layers[name] = layers[name] + value

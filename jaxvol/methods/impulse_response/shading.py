@@ -28,9 +28,20 @@ def emitter_frame(
     return x, jnp.cross(axis, x), axis
 
 
-def zonal_irradiance(radiance: Float[Array, "*b C bands"], cos_angle: Float[Array, "*b"]) -> Float[Array, "*b C"]:
-    """Irradiance of zonal radiances on a plane whose normal makes cos_angle with their axis."""
-    return harmonics.zonal_irradiance(radiance, cos_angle[..., None])
+def half_basis(local: Float[Array, "*b 3"], order: int, bands: tuple[int, ...]) -> dict:
+    """y_lm, m >= 0, at unit directions, by pair (l, m) of the bands asked for."""
+    x, y, z = local[..., 0], local[..., 1], local[..., 2]
+    table = harmonics.normalised_legendre(z, order)
+    values = {}
+    cosine, sine = jnp.ones_like(x), jnp.zeros_like(x)  # sin^m(theta) cos(m phi) and sin(m phi)
+    for m in range(order):
+        values |= {(band, m): table[band, m] * cosine for band in bands if band >= m}
+        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+    return values
+
+
+def _in_frame(frame, direction):
+    return jnp.stack([dot(direction, axis) for axis in frame], axis=-1)
 
 
 def half_irradiance(
@@ -38,9 +49,32 @@ def half_irradiance(
     frame: tuple[Float[Array, "*b 3"], Float[Array, "*b 3"], Float[Array, "*b 3"]],
     normal: Float[Array, "*b 3"],
 ) -> Float[Array, "*b C"]:
-    """Irradiance of mirror-symmetric radiances, given in the frame of `emitter_frame`, on a plane with a world normal."""
-    local = jnp.stack([dot(normal, direction) for direction in frame], axis=-1)
-    return harmonics.half_irradiance(radiance, local[..., None, :])
+    """Irradiance of mirror-symmetric radiances, given in the frame of `emitter_frame`, on a plane with a world normal.
+
+    Sums the bands alone whose clamped cosine does not vanish: 0, 1, 2, 4, 6, ...
+    """
+    order = round((2 * radiance.shape[-1]) ** 0.5 - 0.5)
+    gain = harmonics.rotation_norm(order) * harmonics.clamped_cosine(order)
+    bands = tuple(band for band in range(order) if gain[band] != 0)
+    total = 0.0
+    for (band, m), value in half_basis(_in_frame(frame, normal), order, bands).items():
+        total = total + radiance[..., band * (band + 1) // 2 + m] * (float(gain[band]) * value)[..., None]
+    return total
+
+
+def half_product(
+    radiance: Float[Array, "*b C half"],
+    zonal: Float[Array, "*b bands"],
+    frame: tuple[Float[Array, "*b 3"], Float[Array, "*b 3"], Float[Array, "*b 3"]],
+    axis: Float[Array, "*b 3"],
+) -> Float[Array, "*b C"]:
+    """int L f of a mirror-symmetric radiance and a zonal function about a world axis: sum sqrt(4pi/(2l+1)) f_l L_lm y_lm."""
+    order = zonal.shape[-1]
+    norm = harmonics.rotation_norm(order)
+    total = 0.0
+    for (band, m), value in half_basis(_in_frame(frame, axis), order, tuple(range(order))).items():
+        total = total + radiance[..., band * (band + 1) // 2 + m] * (float(norm[band]) * zonal[..., band] * value)[..., None]
+    return total
 
 
 def phong_lobe(exponent: Float[Array, "*b"], order: int) -> Float[Array, "*b order"]:

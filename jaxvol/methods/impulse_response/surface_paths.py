@@ -22,11 +22,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxvol import ray_casting, sampling
 from jaxvol.methods.impulse_response import emitters
-from jaxvol.methods.impulse_response.lookup import Responses
+from jaxvol.methods.impulse_response.lookup import Pick, Responses
+from jaxvol.methods.impulse_response.receivers import Receiver, like
 from jaxvol.sampling import dot
 from jaxvol.types import Mesh
 
 _STREAM = sampling.stream("impulse_response.surface_paths")
+_PICK = sampling.stream("impulse_response.lookups")
 _LIFT = 2.0**-16  # offset of rays, relative to coordinates
 _UNIFORM = 0.25  # share of uniform directions among rays, where light is scattered
 
@@ -49,6 +51,7 @@ class Proposal(eqx.Module):
     face: Int[Array, "n"]  # of the area technique
     point: Float[Array, "n 3"]
     side: Float[Array, "n"]  # +1 or -1: the side of the face that radiates, area technique
+    pick: Pick  # for the table lookup
 
 
 class Arrival(eqx.Module):
@@ -122,6 +125,7 @@ def propose(
         face=face,
         point=a + w1[:, None] * (b - a) + w2[:, None] * (c - a),
         side=jnp.where(v[2] < 0.5, 1.0, -1.0),
+        pick=sampling.uniforms(seed, _PICK, item, depth, sample)[:2],
     )
 
 
@@ -174,27 +178,31 @@ def transport(
     mesh: Mesh,
     faces: Faces,
     responses: Responses | None,
-    normal: Float[Array, "n 3"],
+    receiver: Receiver,
     proposal: Proposal,
     arrival: Arrival,
     visible: Bool[Array, "n"],
     plumb: Bool[Array, "n"],
     tau: Float[Array, "n 3"] | None,
     probe_sigma: Float[Array, ""],
+    by_marching: Bool[Array, "n"] | None = None,
+    marched: Float[Array, "n *rows 3"] | None = None,
     *,
     shares: tuple[float, float, float],
     image: bool,
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """albedo / pi K / pdf of the step: (all of it, the part that is not scattered on the way)."""
-    technique = proposal.technique
+) -> tuple[Float[Array, "n *rows 3"], Float[Array, "n *rows 3"]]:
+    """albedo / pi K / pdf of the step: (all of it, the part that is not scattered on the way).
+
+    Where `by_marching`, `marched` stands for the tables' response.
+    """
+    normal, technique = receiver.normal, proposal.technique
     visible = visible | (technique == 0)
     cos_x = jnp.maximum(dot(normal, arrival.direction), 0.0)
     cos_y = jnp.maximum(-dot(arrival.normal, arrival.direction), 0.0)
-    geometry = jnp.where(visible, cos_x * cos_y / (arrival.distance * arrival.distance), 0.0)
-    pdf = geometry / pi
+    spread = jnp.where(visible, cos_y / (arrival.distance * arrival.distance), 0.0)
+    pdf = cos_x * spread / pi
     if shares[0] < 1:
-        front = visible & (cos_x > 0)
-        even = jnp.where(front, cos_y / (arrival.distance * arrival.distance), 0.0) / (2 * pi)
+        even = jnp.where(cos_x > 0, spread, 0.0) / (2 * pi)
         pdf = shares[0] * ((1 - _UNIFORM) * pdf + _UNIFORM * even)
     if shares[1] > 0:
         upward = dot(arrival.normal, normal)
@@ -204,12 +212,25 @@ def transport(
         pdf = pdf + shares[1] * jnp.where(reached, ring * upward, 0.0)
     if shares[2] > 0:
         pdf = pdf + shares[2] * 0.5 * faces.density
-    kernel = geometry[:, None] * (1.0 if tau is None else jnp.exp(-tau))
-    plain = kernel
-    if responses is not None:
-        once, more = emitters.patch_arrivals(
-            responses, normal, arrival.direction, arrival.distance, arrival.normal, tau, image=image
-        )
-        kernel = kernel + jnp.where(visible[:, None], once + more, 0.0)
-    weight = mesh.albedo[arrival.face] / pi * jnp.where(arrival.valid, 1 / jnp.maximum(pdf, 1e-30), 0.0)[:, None]
-    return weight * kernel, weight * plain
+    weight = surface_reflectance(mesh, arrival.face) / pi
+    weight = weight * jnp.where(arrival.valid, 1 / jnp.maximum(pdf, 1e-30), 0.0)[:, None]
+    through = 1.0 if tau is None else jnp.exp(-tau)
+    plain = receiver.straight(arrival.direction, weight * spread[:, None] * through)
+    if responses is None:
+        return plain, plain
+    once, more = emitters.patch_arrivals(
+        responses, receiver, arrival.direction, arrival.distance, arrival.normal, tau, image=image, pick=proposal.pick
+    )
+    response = once + more
+    seen = visible.reshape(visible.shape + (1,) * (response.ndim - 1))
+    response = jnp.where(seen, response, 0.0)
+    if marched is not None:
+        response = jnp.where(by_marching.reshape(seen.shape), marched, response)
+    return plain + like(weight, response) * response, plain
+
+
+def surface_reflectance(mesh: Mesh, face: Int[Array, "n"]) -> Float[Array, "n 3"]:
+    """Reflectance of the next vertices: Lambert's, and a Phong lobe's counted as Lambertian."""
+    if mesh.specular is None:
+        return mesh.albedo[face]
+    return jnp.minimum(mesh.albedo[face] + mesh.specular[face], 1.0)

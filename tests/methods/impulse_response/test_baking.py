@@ -1,6 +1,7 @@
 """Receivers, probes and baked files."""
 
 import io
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -74,6 +75,23 @@ def test_a_fin_of_three_faces_at_one_edge_bakes():
     assert found.covered.sum() > 300 and np.all(np.isfinite(found.receiver))
 
 
+def test_own_lightmap_coordinates_and_what_is_wrong_with_them():
+    square = mesh_of([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3], [0, 1, 1]])
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+    uv = corners[[[0, 1, 2], [0, 2, 3], [0, 1, 1]]]
+    found = lightmap.unwrap(square, resolution=16, uv=uv)
+    assert found.covered.all() and found.covered.shape == (16, 16) and found.num_dropped == 1
+    np.testing.assert_allclose(found.receiver[0], [2 * 0.5 / 16, 1 - 0.5 / 16, 0], atol=1e-6)  # row 0 is the top
+    bad = {"must be finite": np.nan, "0 to 1": 1.5}
+    for text, value in bad.items():
+        with pytest.raises(ValueError, match=text):
+            lightmap.unwrap(square, resolution=16, uv=np.where(np.arange(2) == 0, value, uv))
+    with pytest.raises(ValueError, match="2 faces with an area have none"):
+        lightmap.unwrap(square, resolution=16, uv=np.full((3, 3, 2), 0.5))
+    with pytest.raises(ValueError, match="overlap in 120 texels"):
+        lightmap.unwrap(square, resolution=16, uv=uv[[0, 0, 2]])
+
+
 def test_dilation_fills_from_neighbours_only():
     image_, covered = np.zeros((5, 7, 3), np.float32), np.zeros((5, 7), bool)
     image_[2, 1], covered[2, 1] = 3.0, True
@@ -137,6 +155,37 @@ def test_a_bake_goes_on_from_its_parts(tmp_path, box, monkeypatch):
     assert baking.total(whole).max() > 0
 
 
+def _check_gltf(data):
+    """The accessor rules of glTF 2.0 that viewers rely on, read from the bytes of a GLB."""
+    magic, version, length = np.frombuffer(data[:12], np.uint32)
+    assert magic == 0x46546C67 and version == 2 and length == len(data)
+    size = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + size])
+    binary = data[20 + size + 8 :]
+    components = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+    widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+    values = []
+    for accessor in document["accessors"]:
+        view = document["bufferViews"][accessor["bufferView"]]
+        kind = np.dtype(components[accessor["componentType"]])
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        count = accessor["count"] * widths[accessor["type"]]
+        assert start % kind.itemsize == 0 and "byteStride" not in view
+        assert accessor.get("byteOffset", 0) + count * kind.itemsize <= view["byteLength"]
+        values.append(np.frombuffer(binary, kind, count, start).reshape(accessor["count"], -1))
+    for primitive in (p for mesh in document["meshes"] for p in mesh["primitives"]):
+        attributes = primitive["attributes"]
+        position = document["accessors"][attributes["POSITION"]]
+        np.testing.assert_allclose(position["min"], values[attributes["POSITION"]].min(axis=0), rtol=1e-6)
+        np.testing.assert_allclose(position["max"], values[attributes["POSITION"]].max(axis=0), rtol=1e-6)
+        assert values[primitive["indices"]].max() < position["count"] and position["componentType"] == 5126
+        assert all(document["accessors"][index]["count"] == position["count"] for index in attributes.values())
+        if "COLOR_0" in attributes:
+            colour = document["accessors"][attributes["COLOR_0"]]
+            assert colour["type"] in ("VEC3", "VEC4") and (colour["componentType"] == 5126 or colour["normalized"])
+    return document
+
+
 def test_the_command_writes_what_others_read(tmp_path, capsys):
     scene = tmp_path / "cube.toml"
     scene.write_text(SCENE)
@@ -151,7 +200,11 @@ def test_the_command_writes_what_others_read(tmp_path, capsys):
     layers = sum(channels[f"{name}.G"] for name in ("surface_from_light", "surface_from_surface", "surface_from_multiple"))
     np.testing.assert_allclose(layers + channels["surface_from_volume.G"], channels["G"], atol=1e-5)
     textured = trimesh.load(io.BytesIO((tmp_path / "cube_lightmap.glb").read_bytes()), file_type="glb", force="mesh")
+    assert channels["sh.l0.m0.G"].max() > 0.02 and "sh.l2.m-2.R" in channels and "sh.l1.m+1.B" in channels
     assert textured.visual.material.emissiveTexture is not None and len(textured.faces) == 12
+    document = _check_gltf((tmp_path / "cube_lightmap.glb").read_bytes())
+    assert document["materials"][0]["emissiveFactor"] == [1, 1, 1] and "TEXCOORD_0" in str(document["meshes"])
+    assert "COLOR_0" in str(_check_gltf((tmp_path / "cube_vertices.glb").read_bytes())["meshes"])
     coloured = trimesh.load(io.BytesIO((tmp_path / "cube_vertices.glb").read_bytes()), file_type="glb", force="mesh")
     assert np.ptp(coloured.visual.vertex_colors[:, 0]) > 50
     with np.load(tmp_path / "cube_probes.npz", allow_pickle=False) as baked:

@@ -136,11 +136,36 @@ def test_occluders_take_scattered_light_and_the_share_is_told():
         jnp.zeros((4, 3)),
     )
     behind = open_plane(0.9, mesh=mesh)
-    estimate = impulse_response.irradiance(behind, *receivers(), samples=1, max_bounces=0)
+    estimate = impulse_response.irradiance(behind, *receivers(), samples=1, max_bounces=0, occlusion="drop")
     assert np.all(np.asarray(layers.total(estimate.mean))[2:] == 0)
     open_once = found(impulse_response.irradiance(scene, *receivers(), samples=1, max_bounces=0), "surface_from_volume")
     share = open_once[2:].sum() / open_once.sum()  # at 0.5 the receiver stands in the wall's foot and is hidden or not
     assert share - 0.01 < float(estimate.diagnostics["occluded_share"]) < share + open_once[1] / open_once.sum() + 0.01
+
+
+def test_the_papers_modes_of_multiple_scattering():
+    """At g = 0 similarity and three values of g change nothing; at g = 0.5 similarity is too dark (specification 3)."""
+    modes = {"similarity": True, "g_range": 0.5}
+    totals = {}
+    for g in (0.0, 0.5):
+        for name, options in (("table", {}), ("paper", modes)):
+            estimate = impulse_response.irradiance(
+                open_plane(0.5, g), *receivers(), samples=1, max_bounces=0, image=False, **options
+            )
+            totals[g, name] = found(estimate, "surface_from_multiple").sum(), found(estimate, "surface_from_volume").sum()
+    np.testing.assert_allclose(totals[0.0, "paper"], totals[0.0, "table"], rtol=2e-3)
+    assert totals[0.5, "paper"][0] < 0.9 * totals[0.5, "table"][0]
+    np.testing.assert_allclose(totals[0.5, "paper"][1], totals[0.5, "table"][1], rtol=1e-3)  # 0.5 is one of the three
+
+
+def test_lookups_beyond_the_tables_are_counted():
+    thick = Medium(jnp.array([[-9.0] * 3, [9.0] * 3]), jnp.full(3, 20.0), jnp.full(3, 1.0), jnp.float32(0.0))
+    estimate = impulse_response.irradiance(open_plane(0.9, medium=thick), *receivers(), samples=1, max_bounces=0)
+    # 21 per unit: the receivers beyond radius 1.02 lie more than 30 mean free paths off.
+    share = float(estimate.diagnostics["beyond_share"])
+    assert share == pytest.approx(2 / 5, abs=0.01) and np.all(np.isfinite(layers.total(estimate.mean)))
+    near = impulse_response.irradiance(open_plane(0.9), *receivers(), samples=1, max_bounces=0)
+    assert float(near.diagnostics["beyond_share"]) == 0
 
 
 def test_claims_say_what_is_missed():
@@ -151,7 +176,7 @@ def test_claims_say_what_is_missed():
     box = make_scene(
         {"shapes": [{"mesh": "builtin:box"}], "medium": {"density": 1.0, "bounds": [[-1, 0, -1], [1, 2, 1]], "scattering": 1.0}}
     ).scene
-    assert "occluders" in impulse_response.claims(box)[2].partial
+    assert "occluders" in impulse_response.claims(box)[3].partial
 
 
 def test_bad_input():
@@ -160,6 +185,9 @@ def test_bad_input():
         ({"scattering": "all"}, "scattering: 'all'"),
         ({"max_bounces": -1}, "max_bounces: -1"),
         ({"num_lanes": 0}, "num_lanes: 0"),
+        ({"occlusion": "grid"}, "occlusion: 'grid'"),
+        ({"contrast": 2.0}, "contrast: 2.0"),
+        ({"g_range": 1.0}, "g_range: 1.0"),
     ):
         with pytest.raises(ValueError, match=text):
             impulse_response.plan(scene, None, **options)
@@ -184,7 +212,7 @@ def test_render_takes_the_surface_layers():
     table["camera"] |= {"width": 12, "height": 12}
     table["medium"] = {"density": 1.0, "bounds": [[-1, 0, -1], [1, 2, 1]], "scattering": [0.2, 0.3, 0.4], "absorption": 0.01}
     file = make_scene(table)
-    plan = impulse_response.plan(file.scene, file.camera, max_bounces=1)
+    plan = impulse_response.plan(file.scene, file.camera, max_bounces=1, occlusion="drop")
     assert not plan.grey
     estimate = impulse_response.render(file.scene, file.camera, plan, samples=2)
     picture = np.asarray(layers.total(estimate.mean))

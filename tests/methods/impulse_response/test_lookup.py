@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxvol import harmonics, tables, zonal_lookup
+from jaxvol.fit import assemble, table_config
 from jaxvol.methods.impulse_response import lookup, shading
 from jaxvol.types import Medium
 from tests.problems import FLOOR_IN_FOG
@@ -50,20 +51,46 @@ def test_resampled_tables_are_the_tables(table, c, g, kind):
     assert error.mean() < (1e-3 if kind == "area" else 5e-5)
 
 
-def test_floor_in_fog(table):
-    """T13: the coplanar area response integrates to c pi Le (2/3)(1 - ln 2); order 5 of the area table keeps 5e-3 of it."""
+@pytest.fixture(scope="module")
+def fine_table():
+    """Single scattering of isotropic media with patches to order 11, as experiments/tables/fine_area.toml has them."""
+    emitters = {"order": 11, "moments": 1, "area": {"order": 11, "moments": 1, "num_tau": 20, "num_angle": 10}}
+    config = table_config.parse(emitters)
+    parts = {name: assemble.compute_part(name, config) for name in assemble.part_names(config)}
+    return zonal_lookup.from_arrays(assemble.join(parts, config))
+
+
+@pytest.mark.parametrize(("name", "limit"), [("table", 6e-3), ("fine_table", 1e-3)])
+def test_floor_in_fog(name, limit, request):
+    """T13: the coplanar area response integrates to c pi Le (2/3)(1 - ln 2); its series ends with order 5, or with 11."""
     x, weight = np.polynomial.legendre.leggauss(100)
     s = 0.5 * (x + 1) * 5
     distance = (s * s).astype(np.float32)
     far = jnp.broadcast_to(jnp.asarray(distance)[:, None], (100, 3))
     axis = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), (100, 3))
     up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (100, 3))
-    responses = lookup.prepare(table, medium(0.8), grey=True, multiple=False)
+    responses = lookup.prepare(request.getfixturevalue(name), medium(0.8), grey=True, multiple=False)
     once, more = lookup.compact_source(responses.area, responses.albedo, far, far, jnp.zeros((100, 3)))
     assert more is None
     irradiance = shading.half_irradiance(once, shading.emitter_frame(axis, up), up)[:, 0]
     total = np.sum(2 * np.pi * distance * np.asarray(irradiance) * weight * 2.5 * 2 * s)
-    assert total == pytest.approx(0.8 * np.pi * FLOOR_IN_FOG, rel=7e-3)
+    assert total == pytest.approx(0.8 * np.pi * FLOOR_IN_FOG, rel=limit)
+
+
+def test_single_nodes_have_the_mean_of_the_interpolation(table):
+    """Lookups of one node drawn by its weight, averaged over a grid of the random numbers."""
+    found = lookup.prepare(table, medium(0.9), grey=True, multiple=True)
+    u = (jnp.arange(64) + 0.5) / 64
+    pick = tuple(jnp.ravel(v) for v in jnp.meshgrid(u, u))
+    ones = jnp.ones((64 * 64, 3))
+    for tau, cosine in ((0.37, 0.3), (4.1, -0.72), (0.02, 0.99)):
+        arguments = (found.area, found.albedo, tau * ones, 1.3 * ones, cosine * ones)
+        exact = lookup.compact_source(*arguments)
+        drawn = lookup.compact_source(*arguments, pick=pick)
+        for a, b in zip(exact, drawn, strict=True):
+            scale = float(jnp.abs(a[0, 0, 0]))
+            assert float(jnp.abs(b - a).max()) > 1e-3 * scale  # a single node is not the interpolation
+            np.testing.assert_allclose(b.mean(axis=0), a[0], atol=2e-3 * scale)
 
 
 def test_one_compilation_for_two_media(table):
@@ -126,7 +153,7 @@ def test_reflection_of_zonal_radiance_against_the_sphere():
     lobe_axis = np.array([np.sin(0.7), 0, np.cos(0.7)])
     cosine = np.maximum(w @ lobe_axis, 0)
     for power, found in (
-        (1.0, shading.zonal_irradiance(jnp.asarray(radiance)[None, None], jnp.cos(jnp.array([0.7])))[0, 0] / np.pi),
+        (1.0, harmonics.zonal_irradiance(jnp.asarray(radiance), jnp.cos(0.7)) / np.pi),
         (9.0, shading.phong_radiance(jnp.asarray(radiance)[None, None], jnp.array([9.0]), jnp.cos(jnp.array([0.7])))[0, 0]),
     ):
         lobe = (power + 1) / (2 * np.pi) * cosine**power

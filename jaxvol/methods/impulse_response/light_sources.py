@@ -1,0 +1,96 @@
+"""Stage 3, emitters as receivers see them: choice, direction, distance, strength, and the ray that tells what is occluded."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxvol import lights, sampling
+from jaxvol.methods.impulse_response import surface_paths
+from jaxvol.sampling import dot
+from jaxvol.types import Scene
+
+DELTA = ("point", "spot", "directional")
+
+
+class Light(eqx.Module):
+    """One emitter seen from each receiver; `strength` multiplies the response of a unit emitter."""
+
+    direction: Float[Array, "n 3"]
+    distance: Float[Array, "n"]  # inf for light from infinity
+    strength: Float[Array, "n 3"]  # intensity; irradiance facing it; or radiance over density
+    normal: Float[Array, "n 3"] | None = None  # of area emitters
+    infinite: bool = eqx.field(static=True, default=False)
+
+
+def delta_lights(scene: Scene) -> list[tuple[str, int]]:
+    """Kind and index of every point, spot and directional light."""
+    found = []
+    for kind in DELTA:
+        group = getattr(scene, f"{kind}_lights")
+        if group is not None:
+            found += [(kind, i) for i in range(group.direction.shape[0] if kind == "directional" else group.position.shape[0])]
+    return found
+
+
+@partial(jax.jit, static_argnames="kind")
+def see(scene, position, kind, index, u) -> Light:
+    """The light of a kind: `index` [n] for point, spot and directional ones, a random one of the rest by u."""
+    if kind in ("point", "spot"):
+        group = scene.point_lights if kind == "point" else scene.spot_lights
+        delta = group.position[index] - position
+        distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+        direction = delta / distance[:, None]
+        strength = group.intensity[index]
+        if kind == "spot":
+            strength = strength * lights.spot_falloff(group, index, -direction)[:, None]
+        return Light(direction, distance, strength)
+    infinite = jnp.full(position.shape[0], jnp.inf, jnp.float32)
+    if kind == "directional":
+        group = scene.directional_lights
+        return Light(-group.direction[index], infinite, group.irradiance[index], infinite=True)
+    if kind == "environment":
+        direction, pdf = lights.sample_environment(scene.environment, u[0], u[1])
+        radiance = lights.environment_radiance(scene.environment, direction)
+        return Light(direction, infinite, radiance / pdf[:, None], infinite=True)
+    group, mesh = scene.area_lights, scene.mesh
+    face = group.face[sampling.sample_cdf(u[2], group.cdf)]
+    a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
+    w1, w2 = sampling.sample_triangle(u[0], u[1])
+    delta = a + w1[:, None] * (b - a) + w2[:, None] * (c - a) - position
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+    emission = mesh.emission[face]
+    density = lights.luminance(emission) / group.total  # 1/area
+    normal = sampling.normalize(jnp.cross(b - a, c - a))
+    return Light(delta / distance[:, None], distance, emission / density[:, None], normal)
+
+
+@partial(jax.jit, static_argnames="kind")
+def see_again(scene, position, kind, index, light: Light, moved) -> Light:
+    """The same emitter from other points `moved`: a spot's falloff changes, the sample on an area emitter does not."""
+    if light.infinite:
+        return light
+    delta = position + light.distance[:, None] * light.direction - moved
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+    direction = delta / distance[:, None]
+    strength = light.strength
+    if kind == "spot":
+        group = scene.spot_lights
+        strength = group.intensity[index] * lights.spot_falloff(group, index, -direction)[:, None]
+    return Light(direction, distance, strength, light.normal)
+
+
+@jax.jit
+def shadow_ray(scale, position, normal, light: Light):
+    """From the receiver, lifted where it has a normal, to the lifted emitter: origin, direction, length."""
+    start = position if normal is None else surface_paths.lifted(position, normal, scale)
+    if light.infinite:
+        return start, light.direction, light.distance
+    end = position + light.distance[:, None] * light.direction
+    if light.normal is not None:
+        end = surface_paths.lifted(end, light.normal, scale)
+    way = end - start
+    length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-20))
+    return start, way / length[:, None], length

@@ -1,0 +1,84 @@
+"""Segments that are integrated instead of looked up: against quadrature, the path tracer and the tables."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxvol import extinction, layers
+from jaxvol.methods import impulse_response
+from jaxvol.methods.impulse_response import marched
+from jaxvol.methods.impulse_response.light_sources import Light
+from jaxvol.types import DirectionalLights, Medium, Mesh
+from tests.methods.impulse_response.test_irradiance import found, open_plane, receivers
+
+# Irradiance beside a wall of height 1.5 at x = 0.5 (REFERENCE_WALL[albedo] = everything at x = 1, 2, 3 behind it), lamp as in
+# test_irradiance: path_tracing.irradiance.
+WALL = np.array([[0.5, -3, 0], [0.5, 3, 0], [0.5, 3, 1.5], [0.5, -3, 1.5]], np.float32)
+
+
+def behind_a_wall(c):
+    scene = open_plane(c)
+    corners = jnp.concatenate([scene.mesh.vertices, jnp.asarray(WALL)])
+    faces = jnp.concatenate([scene.mesh.faces, jnp.array([[4, 5, 6], [4, 6, 7]])])
+    return open_plane(c, mesh=Mesh(corners, faces, jnp.zeros((4, 3))))
+
+
+def always(scene, **options):
+    """A plan that marches every segment of the receivers."""
+    return dataclasses.replace(impulse_response.plan(scene, None, max_bounces=0, **options), contrast=-1.0)
+
+
+@pytest.mark.parametrize("g", [0.0, 0.5])
+def test_marching_a_homogeneous_medium_gives_the_tables_single_scattering(g):
+    scene = open_plane(0.9, g)
+    looked_up = found(impulse_response.irradiance(scene, *receivers(), samples=1, max_bounces=0), "surface_from_volume")
+    estimate = impulse_response.irradiance(scene, *receivers(), plan=always(scene), samples=6000)
+    error = np.sqrt(np.asarray(estimate.variance.surface_from_volume)[:, 0])
+    assert np.all(np.abs(found(estimate, "surface_from_volume") - looked_up) < 4 * error + 4e-3 * looked_up)
+    assert error.sum() < 0.02 * looked_up.sum() and float(estimate.diagnostics["marched_share"]) == 1
+
+
+def test_marching_sunlight_gives_the_tables_single_scattering():
+    """A slab so wide and deep that it is the table's half-space lit straight down, receiver 2 mean free paths below its top."""
+    medium = Medium(jnp.array([[-40.0, -40, 0], [40, 40, 2]]), jnp.full(3, 0.9), jnp.full(3, 0.1), jnp.float32(0.3))
+    sun = DirectionalLights(jnp.array([[0.0, 0.0, -1.0]]), jnp.ones((1, 3)))
+    scene = open_plane(0.9, medium=medium, point_lights=None, directional_lights=sun)
+    points, normals = np.zeros((1, 3), np.float32), np.float32([[0, 0, 1]])
+    looked_up = found(impulse_response.irradiance(scene, points, normals, samples=1, max_bounces=0), "surface_from_volume")
+    estimate = impulse_response.irradiance(scene, points, normals, plan=always(scene), samples=16384)
+    error = np.sqrt(np.asarray(estimate.variance.surface_from_volume)[:, 0])
+    assert np.abs(found(estimate, "surface_from_volume") - looked_up) < 4 * error + 2e-3 * looked_up
+    assert error < 0.02 * looked_up
+
+
+def test_contrast_is_measured_around_segments():
+    constant = Medium(jnp.array([[-2.0] * 3, [2.0] * 3]), jnp.ones(3), jnp.ones(3), jnp.float32(0.0), jnp.ones((4, 4, 4)))
+    half = dataclasses.replace(constant, density=jnp.ones((4, 4, 4)).at[2:].set(0.0))
+    position = jnp.array([[-1.0, 0, 0], [1.2, 0, 0], [-0.2, 0, 0]])
+    light = Light(jnp.array([[0.0, 0, 1]] * 3), jnp.full(3, 0.4), jnp.ones((3, 3)))
+    normal = light.direction
+    for medium, expected in ((constant, [0, 0, 0]), (half, [0, 0, 1])):
+        found = marched.contrast(extinction.marching_medium(medium), position, normal, light)
+        assert np.all((np.asarray(found) > 0.2) == np.array(expected, bool))
+
+
+def test_a_varying_medium_is_marched_and_a_constant_one_looked_up():
+    scene = open_plane(0.9)
+    for density, expected in ((np.ones((4, 4, 4)), 0.0), (np.linspace(0, 1, 64).reshape(4, 4, 4), 1.0)):
+        grid = dataclasses.replace(scene.medium, density=jnp.asarray(density, jnp.float32))
+        estimate = impulse_response.irradiance(open_plane(0.9, medium=grid), *receivers(), samples=4, max_bounces=0)
+        assert float(estimate.diagnostics["marched_share"]) == expected
+    plan = impulse_response.plan(open_plane(0.9, medium=grid), None, contrast=None)
+    assert plan.contrast is None
+
+
+def test_light_goes_around_a_wall():
+    scene, points, normals = behind_a_wall(0.5), *receivers()
+    points = points + np.float32([0.01, 0, 0])
+    dropped = impulse_response.irradiance(scene, points, normals, samples=1, max_bounces=0, occlusion="drop")
+    assert np.all(np.asarray(layers.total(dropped.mean))[2:] == 0)
+    estimate = impulse_response.irradiance(scene, points, normals, samples=8192, max_bounces=0)
+    assert np.all(found(estimate, "surface_from_volume")[2:] > 0)
+    assert float(estimate.diagnostics["occluded_share"]) == 0
