@@ -221,7 +221,7 @@ def num_lights(scene: Scene) -> int:
 def _point_like(position, origin, intensity, shading):
     """A sample towards `origin` of an isotropic emitter; shading(travel direction) scales the intensity."""
     delta = origin - position
-    squared = jnp.maximum(dot(delta, delta), 1e-20)
+    squared = jnp.maximum(dot(delta, delta), 1e-28)
     distance = jnp.sqrt(squared)
     direction = delta / distance[..., None]
     radiance = intensity * (shading(-direction) / squared)[..., None]
@@ -237,7 +237,7 @@ def _sample_area(scene, position, u1, u2, u3):
     point = a + w1[..., None] * (b - a) + w2[..., None] * (c - a)
     normal = normalize(jnp.cross(b - a, c - a))
     delta = point - position
-    squared = jnp.maximum(dot(delta, delta), 1e-20)
+    squared = jnp.maximum(dot(delta, delta), 1e-28)
     distance = jnp.sqrt(squared)
     direction = delta / distance[..., None]
     cosine = -dot(normal, direction)

@@ -187,7 +187,8 @@ def _closest_approach(origin, direction, point):
     delta = point - origin
     t = dot(delta, direction)
     perpendicular = delta - t[:, None] * direction
-    return t, jnp.sqrt(jnp.maximum(dot(perpendicular, perpendicular), 1e-12))
+    # No nearer than a millionth of the way, whatever the unit of length.
+    return t, jnp.sqrt(jnp.maximum(dot(perpendicular, perpendicular), 1e-12 * dot(delta, delta) + 1e-30))
 
 
 def _from_angle(angle, x, distance):

@@ -19,7 +19,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "num_surfels": 64, "num_levels": 2, "num_intervals": 4, "num_steps": 16, "table_resolution": 4, "light_steps": 8,
     },
     "instant_multiple_scattering": {
-        "num_paths": 16, "max_depth": 32, "num_levels": 1, "num_chains": 1, "num_direct": 1, "tile": 64, "eye_steps": 16,
+        "num_paths": 8, "max_depth": 4, "num_levels": 1, "num_chains": 1, "num_direct": 1, "tile": 64, "eye_steps": 16,
     },
     "impulse_response": {"samples": 1, "max_bounces": 2, "num_lanes": 64},
     "lattice_boltzmann": {"resolution": 6, "surface_rays": 256, "samples_per_pixel": 1, "max_applications": 60},
@@ -38,12 +38,14 @@ class Refused(Exception):
 
 
 def render(config: scenes.Config, method: str, *, seed: int = 0) -> Layers:
-    """The method's layers with the options of the stress test. Raises Refused."""
+    """The method's layers with the options of the stress test. Raises Refused where the scene or the plan is refused."""
+    module = rendering.load_method(method)
     try:
         file = make_scene(config | {"render": {method: OPTIONS[method], "seed": seed}})
-        return rendering.render_scene(file, method=method).estimate.mean
+        module.plan(file.scene, file.camera, **rendering.method_arguments(module, method, file)[0])
     except ValueError as error:
         raise Refused(str(error)) from error
+    return rendering.render_scene(file, method=method).estimate.mean
 
 
 def picture(layers: Layers) -> np.ndarray:
@@ -102,6 +104,11 @@ def furnace(config: scenes.Config, method: str) -> str | None:
     means = [picture(render(config, method, seed=seed)).mean() for seed in range(1, BATCHES + 1)]
     limit = 1 + FURNACE + 3 * np.std(means, ddof=1) / np.sqrt(BATCHES)
     return None if np.mean(means) <= limit else f"furnace: mean {np.mean(means):.4g} above {limit:.4g}"
+
+
+def size(config: scenes.Config) -> float:
+    """How far the camera stands from what it looks at: the scene's unit of length, about."""
+    return float(np.linalg.norm(np.subtract(config["camera"]["origin"], config["camera"]["target"])))
 
 
 def clear_caches() -> None:

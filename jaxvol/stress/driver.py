@@ -40,6 +40,8 @@ def run_case(config: scenes.Config, number: int | None, name: str, method: str) 
         layers = checks.render(config, method)
     except checks.Refused as error:
         return {"refused": str(error)}
+    except (ValueError, TypeError, ArithmeticError, IndexError) as error:
+        return {"failed": [f"raised {type(error).__name__}: {error}"], "passed": [], "seconds": 0.0}
     problem = checks.sound(layers)
     note("sound", problem)
     if problem is None:
@@ -48,7 +50,8 @@ def run_case(config: scenes.Config, number: int | None, name: str, method: str) 
             note("linear", checks.linear(config, method, base))
             turn = None if number is None else number // len(scenes.CLASSES)  # scenes of this class before
             if turn is None or turn % _EVERY_UNITS == 0:
-                factor = 1 / checks.UNIT if turn is not None and turn % (2 * _EVERY_UNITS) else checks.UNIT
+                large = turn % (2 * _EVERY_UNITS) > 0 if turn is not None else checks.size(config) > 1e3
+                factor = 1 / checks.UNIT if large else checks.UNIT
                 note("units", checks.unit_free(config, method, base, factor=factor))
             if turn is not None and turn % _EVERY_TURN == 0:
                 note("turned", checks.turns(config, method))

@@ -66,6 +66,7 @@ def build_transport(scene: Scene, active: ActiveRays, lit: LitSurfels, plan: Pla
         cluster_size=plan.cluster_size,
         resolution=plan.table_resolution,
         grey=active.map.weight.shape[0] == 1,
+        scale=float(ray_casting.scene_scale(scene.mesh)),
     )
     return table, cells.index
 

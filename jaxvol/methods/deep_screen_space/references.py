@@ -64,7 +64,7 @@ def exact_pairs(
     ).row[:, 0]
     emitted = np.asarray(rows)[:, 9:12]
     distance, weight = np.asarray(active.map.distance), np.asarray(active.map.weight)
-    num_samples = distance.shape[0]
+    num_samples, scale = distance.shape[0], ray_casting.scene_scale(scene.mesh)
     weight = np.broadcast_to(weight, (num_samples, *weight.shape[1:]))
     todo = [(k, place[int(p)]) for k, p in enumerate(pixels) if int(p) in place]
     entries = [(k, a, n) for k, a in todo for n in range(num_samples)]
@@ -79,7 +79,8 @@ def exact_pairs(
         toward = delta / np.maximum(length, 1e-12)[..., None]
         if visibility:
             start = np.broadcast_to(
-                np.asarray(ray_casting.offset_origin(lit.position, lit.normal, lit.normal)), toward.shape
+                np.asarray(ray_casting.offset_origin(lit.position, lit.normal, lit.normal, scale=scale)),
+                toward.shape,
             )
             blocked = np.asarray(ray_casting.occluded(caster, start, toward, length * (1.0 - _MARGIN)))
             values = np.where(blocked, 0.0, values)

@@ -82,8 +82,8 @@ def level_surfels(
     """
     inner, outer = shell(first, level=level, num_levels=num_levels, tail=tail)
     emitted = lit.radiance * (lit.area * 4.0**level)[:, None]
-    delta = lit.area * (0.5 / jnp.pi)
-    columns = [*(lit.position - origin).T, *lit.normal.T, inner, outer, jnp.maximum(delta, 1e-20), *emitted.T]
+    delta = jnp.maximum(lit.area * (0.5 / jnp.pi), 1e-10 * jnp.max(lit.area))
+    columns = [*(lit.position - origin).T, *lit.normal.T, inner, outer, delta, *emitted.T]
     if lit.lobe_direction is not None:
         columns += [*lit.lobe_direction.T, lit.lobe_exponent]
     row = jnp.stack(columns, axis=-1)[order.reshape(-1)]

@@ -68,17 +68,17 @@ def locate(
 
 @partial(jax.jit, static_argnames=("cluster_size",))
 def representatives(
-    lit: LitSurfels, points: Float[Array, "U 3"], seed, *, cluster_size: int
+    lit: LitSurfels, points: Float[Array, "U 3"], seed, *, cluster_size: int, scale: float | Float[Array, ""] = 1.0
 ) -> tuple[Float[Array, "C U 3"], Float[Array, "C U 3"], Float[Array, "C U"]]:
     """For every cluster and receiving point a surfel: position, direction to the point, and the distance (0: none lit).
 
     Of a few surfels drawn by flux one is drawn by flux cos/d^2, what it sends (resampled importance sampling): the
-    nearest surfels of a cluster send most and are dimmed least.
+    nearest surfels of a cluster send most and are dimmed least. `scale` is the size of the scene.
     """
     num_clusters = lit.area.shape[0] // cluster_size
     flux = (jnp.max(lit.radiance, axis=-1) * lit.area).reshape(num_clusters, cluster_size)
     total = jnp.sum(flux, axis=1)
-    cdf = jnp.cumsum(flux, axis=1) / jnp.maximum(total, 1e-30)[:, None]
+    cdf = jnp.cumsum(flux, axis=1) / jnp.where(total > 0, total, 1.0)[:, None]
     shift = sampling.uniforms(seed, _STREAM, jnp.arange(num_clusters), 1_000_003)[0]
     wanted = (jnp.arange(_CANDIDATES) + shift[:, None]) / _CANDIDATES
     pick = jax.vmap(jnp.searchsorted)(cdf, wanted)
@@ -89,9 +89,9 @@ def representatives(
     weight_sum = jnp.zeros(chosen.shape, jnp.float32)
     for k in range(_CANDIDATES):  # weighted reservoir: one pass, one candidate kept
         delta = points - position[:, k, None]
-        squared = jnp.maximum(sampling.dot(delta, delta), 1e-12)
+        squared = jnp.maximum(sampling.dot(delta, delta), 1e-12 * scale * scale)
         cosine = sampling.dot(delta, normal[:, k, None]) * jax.lax.rsqrt(squared)
-        weight = jnp.maximum(cosine, 1e-4) / squared
+        weight = jnp.maximum(cosine, 1e-4) * (scale * scale / squared)
         weight_sum = weight_sum + weight
         take = u * weight_sum < weight
         u = jnp.where(take, u * weight_sum / weight, (u * weight_sum - weight) / jnp.maximum(weight_sum - weight, 1e-30))
@@ -101,7 +101,7 @@ def representatives(
     delta = points - start
     distance = jnp.sqrt(sampling.dot(delta, delta))
     direction = delta / jnp.maximum(distance, 1e-20)[..., None]
-    origin = ray_casting.offset_origin(start, normal[rows, chosen], normal[rows, chosen])
+    origin = ray_casting.offset_origin(start, normal[rows, chosen], normal[rows, chosen], scale=scale)
     return origin, direction, jnp.where(total[:, None] > 0, distance, 0.0)
 
 
@@ -115,6 +115,7 @@ def build_table(
     cluster_size: int,
     resolution: int,
     grey: bool,
+    scale: float = 1.0,
 ) -> Float[np.ndarray, "channels C cells"]:
     """Transmittance times visibility of every cluster and occupied cell, one channel if grey. Eager: it casts rays.
 
@@ -122,10 +123,12 @@ def build_table(
     """
     num_clusters = lit.area.shape[0] // cluster_size
     used = np.flatnonzero(np.asarray(cells.used))
+    if used.size == 0:  # all weights have underflowed
+        return np.zeros((1 if grey else 3, num_clusters, resolution**3), np.float32)
     size = max(64, 1 << (max(used.size, 1) - 1).bit_length())
     padded = np.concatenate([used, np.zeros(size - used.size, np.int64)])
     points = np.asarray(cells.point)[padded]
-    origin, direction, distance = representatives(lit, points, jnp.uint32(seed), cluster_size=cluster_size)
+    origin, direction, distance = representatives(lit, points, jnp.uint32(seed), cluster_size=cluster_size, scale=scale)
     through = transmittance(origin.reshape(-1, 3), direction.reshape(-1, 3), distance.reshape(-1))
     channels = 1 if grey else 3
     through = np.asarray(through)[:, :channels].T.reshape(channels, num_clusters, size)[..., : used.size]

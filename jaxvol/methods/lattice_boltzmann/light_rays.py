@@ -189,10 +189,10 @@ def reflected(scene: Scene, low: np.ndarray, high: np.ndarray, *, count: int, se
     u = kronecker(count, 8, seed + 1)
     columns = [jnp.asarray(u[:, k], jnp.float32) for k in range(5)]
     sent = emission.sample_emission(scene, *columns)
-    caster = ray_casting.caster_for(scene.mesh)
+    caster, scale = ray_casting.caster_for(scene.mesh), ray_casting.scene_scale(scene.mesh)
     start = jnp.where(
         sent.on_surface[:, None],
-        ray_casting.offset_origin(sent.position, sent.normal, sent.direction),
+        ray_casting.offset_origin(sent.position, sent.normal, sent.direction, scale=scale),
         sent.position,
     )
     start, way = np.array(start, np.float32), np.array(sent.direction, np.float32)
@@ -215,7 +215,7 @@ def reflected(scene: Scene, low: np.ndarray, high: np.ndarray, *, count: int, se
     normal = materials.facing_normal(hits.normal, jnp.asarray(way))
     u6, u7 = (jnp.asarray(u[:, k], jnp.float32) for k in (5, 6))
     out = sampling.sample_cosine_hemisphere(u6, u7, normal)
-    origin = np.array(ray_casting.offset_origin(hits.position, normal, out), np.float64)
+    origin = np.array(ray_casting.offset_origin(hits.position, normal, out, scale=scale), np.float64)
     direction = np.asarray(out, float)
     kept = (power.max(1) > 0) & _meets_box(origin, direction, low, high)
     return _with_shadows(scene, origin[kept], direction[kept], power[kept])

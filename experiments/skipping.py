@@ -1,0 +1,135 @@
+"""What skipping is worth: each thing that a scene may lack, with the seconds and the compiled operations with and without it.
+
+    python experiments/skipping.py [NAME ...] [--out DIR]
+
+Each side runs in a process of its own, without the compilation cache, and XLA writes down the programs that it compiles:
+`operations` counts their instructions before optimization, `modules` the programs. Seconds are warm, the median of five.
+Finished rows are kept in DIR/rows.json; `--again` forgets them.
+"""
+
+import argparse
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+DEAR = ("gather", "scatter", "sort", "while", "log", "exponential", "power", "divide", "sqrt", "dot")
+
+
+def find(name):
+    from jaxvol.benchmark.skips import SKIPS
+
+    return next(skip for skip in SKIPS if skip.name == name)
+
+
+def run_side(name, side, picture):
+    """In a process of its own: render, and print seconds as JSON."""
+    import numpy as np
+
+    from jaxvol import rendering
+    from jaxvol.layers import total
+    from jaxvol.scene import make_scene
+
+    skip = find(name)
+    config = skip.present if side == "with" else skip.absent
+    options = skip.options | (skip.without if side == "without" else {})
+    file = make_scene(config | {"render": {skip.method: options}})
+    result = rendering.render_scene(file, method=skip.method)
+    seconds = []
+    for _ in range(5):
+        start = time.perf_counter()
+        warm = rendering.render_scene(file, method=skip.method)
+        seconds.append(time.perf_counter() - start)
+    np.save(picture, np.asarray(total(warm.estimate.mean)))
+    print(json.dumps({"seconds": statistics.median(seconds), "compile": result.seconds["compile"], "skipped": warm.skipped}))
+
+
+def operations(folder):
+    """Instructions by opcode in all programs that XLA compiled, before optimization."""
+    counts, modules = Counter(), 0
+    for path in Path(folder).glob("*before_optimizations.txt"):
+        modules += 1
+        counts.update(re.findall(r" = [^=\n]*? ([a-z][a-z0-9-]*)\(", path.read_text()))
+    return counts, modules
+
+
+def measure(name, side):
+    """Seconds, operations and the picture of one side."""
+    import numpy as np
+
+    with tempfile.TemporaryDirectory() as folder:
+        picture = Path(folder) / "picture.npy"
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+        environment["XLA_FLAGS"] = f"--xla_dump_to={folder} --xla_dump_hlo_as_text --xla_dump_hlo_module_re=.*"
+        command = [sys.executable, __file__, "--one", name, side, str(picture)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise SystemExit(f"{name}, {side}: {done.stderr.strip().splitlines()[-1]}")
+        found = json.loads(done.stdout.splitlines()[-1])
+        counts, modules = operations(folder)
+        found |= {"operations": sum(counts.values()), "modules": modules, "dear": {k: counts[k] for k in DEAR}}
+        return found, np.load(picture)
+
+
+def row_of(skip):
+    """Both sides of a skip."""
+    import numpy as np
+
+    (ours, a), (theirs, b) = (measure(skip.name, side) for side in ("with", "without"))
+    difference = float(np.abs(a - b).sum() / max(np.abs(b).sum(), 1e-30))
+    row = {"name": skip.name, "method": skip.method, "what": skip.what, "with": ours, "without": theirs}
+    return row | {"difference": difference, "limit": skip.equal, "equal": skip.equal is None or difference <= skip.equal}
+
+
+def show(rows):
+    """The table."""
+    head = (
+        f"{'lacks':24s} {'method':28s} {'with s':>7s} {'without':>8s} {'gain':>6s} {'operations':>16s} {'picture':>9s}  skipped"
+    )
+    print(head)
+    for row in rows:
+        a, b = row["with"], row["without"]
+        operations_ = f"{a['operations']} / {b['operations']}"
+        picture = f"{row['difference']:.1e}" if row["limit"] is not None else "(noise)"
+        print(
+            f"{row['name']:24s} {row['method']:28s} {a['seconds']:7.3f} {b['seconds']:8.3f} "
+            f"{b['seconds'] / a['seconds']:5.2f}x {operations_:>16s} {picture:>9s}  {row['what']}"
+        )
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME")
+    parser.add_argument("--out", type=Path, default=Path("out/skipping"))
+    parser.add_argument("--again", action="store_true")
+    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
+    chosen = parser.parse_args()
+    if chosen.one:
+        run_side(*chosen.one)
+        return
+    from jaxvol.benchmark.skips import SKIPS
+
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    path = chosen.out / "rows.json"
+    rows = {} if chosen.again or not path.exists() else {row["name"]: row for row in json.loads(path.read_text())}
+    for skip in SKIPS:
+        if (not chosen.names or skip.name in chosen.names) and skip.name not in rows:
+            rows[skip.name] = row_of(skip)
+            print(f"{skip.name}: done", file=sys.stderr, flush=True)
+            path.write_text(json.dumps(list(rows.values()), indent=1))
+    ordered = [rows[skip.name] for skip in SKIPS if skip.name in rows]
+    show(ordered)
+    raise SystemExit(0 if all(row["equal"] for row in ordered) else 1)
+
+
+if __name__ == "__main__":
+    main()
