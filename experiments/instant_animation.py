@@ -53,7 +53,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--size", type=int, default=24)
-    parser.add_argument("--paths", type=int, default=256)
+    parser.add_argument("--paths", type=int, default=1024)
     arguments = parser.parse_args()
     scenes = [plume(24, time=STEP * k) for k in range(arguments.frames)]
     camera = square_camera(arguments.size)

@@ -4,6 +4,10 @@ A binary tree of the lights (split at the median of the longest axis) is cut for
 cluster's bound, strength * min(1/r^2, 1/d^2) * exp(-sigma_t r) at its nearest minus its farthest place, stays below a
 share of the total. A cut visits about twice its size in nodes, each at best the cost of a pair of the gather kernel in
 a loop that cannot be vectorised over lights: it pays where 2 * cut * penalty < number of lights.
+
+Decision: not built. By this model a cut for every pixel costs as much as gathering 1,000 to 3,600 lights (2 % a cluster); one
+choice of lights for the whole picture (`selection`, rows and columns of the light matrix) gathers about 1,100 of 27,000 in
+the vectorised kernel and adds less noise than the paths themselves have (experiments/instant_equal_time.py).
 Usage: python experiments/instant_hierarchy.py [--error 0.02] [--penalty 10].
 """
 

@@ -20,7 +20,15 @@ from instant_common import figure, fogged_room, out_folder, plume, square_camera
 
 from jaxvol import media, ray_casting
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering import compensation, maps, receivers, rendering, stages, virtual_lights
+from jaxvol.methods.instant_multiple_scattering import (
+    compensation,
+    eye_rays,
+    maps,
+    receivers,
+    rendering,
+    stages,
+    virtual_lights,
+)
 
 RECEIVERS = 256
 PLUME = {
@@ -94,7 +102,7 @@ def gather_rows(scene, name, options_of):
         if lights is None:
             lights, _ = rendering.trace_lights(scene, ray_casting.caster_for(scene.mesh, kind=plan.caster), plan, seed=3)
         context, _ = rendering.make_context(scene, plan, seed=3, lights=lights)
-        rays, _ = rendering.eye_rays(context, camera, jnp.arange(4096, dtype=jnp.uint32))
+        rays, _ = eye_rays.through_pixels(context, camera, jnp.arange(4096, dtype=jnp.uint32))
         segments = stages.segments_of(context, *rays[:3])
         found, seconds = timed(lambda c=context, s=segments, r=rays: stages.gather_segments(c, s, r[4]))
         pairs = 4096 * virtual_lights.num_lights(lights)

@@ -20,12 +20,12 @@ from jaxvol.methods import path_tracing
 from jaxvol.methods.instant_multiple_scattering.rendering import NAMES, gather_rays, make_context, render_set
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import sizes as sizes_of
 
-# Many lights in a set and few marched to: light paths are most of the noise of a mean over a picture.
+# Many paths in a set and few lights of them gathered or marched to: paths are most of the noise of a mean over a picture.
 SETTINGS = {
     "infinite": {"num_paths": 8192, "num_direct": 8, "jitter": False},
-    "cube": {"num_paths": 16384},
-    "cube_g": {"num_paths": 16384, "num_direct": 32},
-    "plume": {"num_paths": 16384, "num_direct": 8, "group_size": 40},
+    "cube": {"num_paths": 65536, "max_lights": 4096, "num_direct": 8},
+    "cube_g": {"num_paths": 65536, "max_lights": 8192, "num_direct": 32},
+    "plume": {"num_paths": 32768, "max_lights": 8192, "num_direct": 8, "group_size": 40},
     "room": {"num_paths": 16384, "num_direct": 8, "group_size": 100, "light_stride": 16},
     "corner": {"num_paths": 65536, "num_direct": 8, "group_size": 100, "light_stride": 16},
 }

@@ -11,6 +11,8 @@ from jaxvol.types import Camera, Scene
 
 _CLAIMED = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in ("surface", "volume", "multiple"))
 _MAP_BYTES = 300e6
+_LEFT = 0.004  # of the energy, beyond the last compensation step
+_MOST_LEVELS = 3
 _PICKS_A_MARCH_IS_WORTH = 20  # lights a group: marching and casting cost about ten kernel evaluations
 
 
@@ -19,6 +21,7 @@ class Plan:
     """Static decisions; every field but `skipped` is an argument of `plan` or follows from the scene."""
 
     num_paths: int
+    max_lights: int | None  # kept of those of all paths; None = all
     num_sets: int
     max_depth: int
     lights: str
@@ -85,11 +88,12 @@ def plan(
     camera: Camera,
     *,
     num_paths: int = 1024,
+    max_lights: int | None = None,
     num_sets: int = 1,
     max_depth: int = 256,
     lights: str = "points",
     mean_free_paths: float | None = 0.35,
-    num_levels: int = 3,
+    num_levels: int | None = None,
     num_chains: int = 2,
     num_direct: int = 4,
     light_stride: int = 8,
@@ -117,14 +121,17 @@ def plan(
 ) -> Plan:
     """Decide how to render a scene; eager.
 
-    num_paths: light paths of a set; num_sets: independent sets that are averaged (two or more give a variance).
+    num_paths: light paths of a set; max_lights: about so many of their lights are gathered, those that the picture sees most
+    (unbiased; ten thousand paths cost little, ten thousand lights do not; None: all); num_sets: independent sets that are
+    averaged (two or more give a variance).
     lights: virtual "points", or "rays": whole flights, neither clamped nor compensated (homogeneous, no surfaces).
     mean_free_paths: clamp distance d = mean_free_paths / local sigma_t, at most a tenth of the scene (None: unclamped).
-    num_levels: compensation steps; 0 = clamped only (biased). num_chains: chains of new vertices per receiver
-    that gather from virtual lights; num_direct: chains that only see the primary lights, which are cheap.
+    num_levels: compensation steps; 0 = clamped only (biased); None: as many as leave less than 0.4 % of the energy to what
+    happens beyond the last step, at most three. num_chains: chains of new vertices per receiver that gather from virtual
+    lights; num_direct: chains that only see the primary lights, which are cheap.
     light_stride: new vertices gather from one of `light_stride` lights, another share each time.
-    end: what happens beyond the last step: "clamped" (loses about (0.7 mean_free_paths)^(num_levels + 1) of the energy,
-    0.4 % by default), "unclamped" (unbiased, infinite variance), "reduced" (bound times 16).
+    end: what happens beyond the last step: "clamped" (loses about (0.7 albedo mean_free_paths)^(num_levels + 1) of the
+    energy), "unclamped" (unbiased, infinite variance), "reduced" (bound times 16).
     distance: "weight" or the paper's "exponential"; transmittance to new vertices: "true", "local" (biased), or
     "detected": local where the gradient of sigma_t is small. visibility of new vertices: "rays", "maps" (the depth map of
     the nearest light with a least-depth test; approximate), or "none" (biased near surfaces).
@@ -156,8 +163,10 @@ def plan(
     least = {"num_paths": 1, "num_sets": 1, "max_depth": 1, "num_levels": 0, "num_chains": 1, "num_direct": 1}
     least.update(map_size=4, map_steps=1, num_evaluations=1, group_size=1, mip_block=1, upsample=1, tile=64)
     for key, low in least.items():
-        if locals()[key] < low:
+        if locals()[key] is not None and locals()[key] < low:
             raise ValueError(f"{key}: {locals()[key]} is not allowed, must be >= {low}")
+    if max_lights is not None and max_lights < 64:
+        raise ValueError(f"max_lights: {max_lights} is not allowed, must be >= 64 (or none for all)")
     if light_stride not in (1, 2, 4, 8, 16):
         raise ValueError(f"light_stride: {light_stride} is not allowed, must be 1, 2, 4, 8 or 16")
     if mean_free_paths is not None and not mean_free_paths > 0:
@@ -172,8 +181,11 @@ def plan(
         raise ValueError("lights: 'rays' is not allowed here, it needs a homogeneous medium and no surfaces")
     low, high = _extent(scene)
     side = float(np.max(high - low))
+    if num_levels is None:
+        num_levels = _levels(scene, mean_free_paths) if values and scatters and scene.mesh is None else _MOST_LEVELS
     return Plan(
         num_paths=num_paths,
+        max_lights=max_lights if lights == "points" else None,
         num_sets=num_sets,
         max_depth=max_depth,
         lights=lights,
@@ -208,7 +220,7 @@ def plan(
         costly=tracked or scene.mesh is not None,
         volume=scatters and lit,
         surface=reflects and lit and (scatters or scene.mesh is not None),
-        skipped=_skipped(scene, lit, scatters, reflects, values),
+        skipped=_skipped(scene, lit, scatters, reflects, values, num_levels),
     )
 
 
@@ -266,7 +278,25 @@ def _columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsam
     return "maps" if fits and receivers > 1.5 * map_size * map_size else "march"
 
 
-def _skipped(scene, lit, scatters, reflects, values):
+def _levels(scene, mean_free_paths):
+    """Compensation steps that leave less than `_LEFT` of the energy that scattered at least twice.
+
+    Of that, a share 0.7 min(d, size) / min(mean free path, size) has its last segment within the clamp distance d, and each
+    step passes on at most 0.7 albedo sigma_t min(d, size) of what it receives.
+    """
+    if mean_free_paths is None:
+        return 0
+    medium = scene.medium
+    albedo = float(np.max(np.asarray(medium.sigma_s) / np.maximum(np.asarray(media.sigma_t(medium)), 1e-30)))
+    thickness = max(_thickness(scene), 1e-30)
+    within = 0.7 * min(mean_free_paths, thickness)
+    left, number = within / min(1.0, thickness), 0
+    while left > _LEFT and number < _MOST_LEVELS:
+        left, number = left * within * albedo, number + 1
+    return number
+
+
+def _skipped(scene, lit, scatters, reflects, values, num_levels):
     reasons = []
     if not lit:
         reasons.append("no light: nothing is traced or gathered")
@@ -287,7 +317,7 @@ def _skipped(scene, lit, scatters, reflects, values):
     if scatters and values and _thickness(scene) < 0.1:
         reasons.append(
             f"optically thin (at most {_thickness(scene):.2g} across): multiple scattering is a small share of single; "
-            "still computed"
+            f"{num_levels} compensation steps"
         )
     return tuple(reasons)
 

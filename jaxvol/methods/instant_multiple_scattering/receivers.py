@@ -1,12 +1,13 @@
 """What gathers light: eye rays inside the medium, and points in the medium or on surfaces."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxvol import materials, media, sampling
-from jaxvol.types import Medium, Mesh
+from jaxvol import materials, media, ray_casting, sampling
+from jaxvol.types import Medium, Mesh, Scene
 
 
 class Segments(eqx.Module):
@@ -30,6 +31,17 @@ class Points(eqx.Module):
     on_surface: Bool[Array, "n"] | None = None
     normal: Float[Array, "n 3"] | None = None
     surface: materials.Surface | None = None
+
+
+@jax.jit
+def lifted(scene: Scene, points: Points) -> Float[Array, "n 3"]:
+    """Points, those on surfaces moved off them to the side of `outgoing`."""
+    if points.on_surface is None:
+        return points.position
+    moved = ray_casting.offset_origin(
+        points.position, points.normal, points.outgoing, scale=ray_casting.scene_scale(scene.mesh)
+    )
+    return jnp.where(points.on_surface[:, None], moved, points.position)
 
 
 def column_between(medium: Medium, a: Float[Array, "*n 3"], b: Float[Array, "*n 3"], *, num_steps: int) -> Float[Array, "*n"]:
@@ -106,6 +118,46 @@ def sample_transmittance(
     fraction = (column - before) / jnp.maximum(after - before, 1e-30)
     t = segments.t0 + (step + jnp.clip(fraction, 0.0, 1.0)) * (length / number)
     return t, jnp.where(total > 0, inverse, 0.0)
+
+
+def sample_transmittance_or_light(
+    segments: Segments,
+    u: Float[Array, "n"],
+    to_light: Bool[Array, "n"],
+    sigma: Float[Array, ""],
+    light: Float[Array, "n 3"],
+    near: Bool[Array, "n"],
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """`sample_transmittance`, half of it replaced by equi-angular distances where the light is `near` (balance heuristic).
+
+    `to_light` says which half, at random or in turn. Without it a light in the medium makes single rays that pass it very
+    bright. Returns (t, w) as `sample_transmittance` does.
+    """
+    t, w = sample_transmittance(segments, u, sigma)
+    place = jnp.where(near[:, None], light, segments.origin)
+    ray = (segments.origin, segments.direction, segments.t0, segments.t1, place)
+    t_light, _ = sampling.sample_equiangular(u, *ray)
+    chosen = jnp.where(near & to_light, t_light, t)
+    pdf = sampling.sample_equiangular_pdf(chosen, *ray)
+    density, inverse = _density_and_inverse(segments, chosen, sigma)
+    mixed = density / jnp.maximum(0.5 * density / jnp.maximum(inverse, 1e-30) + 0.5 * pdf, 1e-30)
+    return chosen, jnp.where(near, jnp.where(inverse > 0, mixed, 0.0), w)
+
+
+def _density_and_inverse(segments, t, sigma):
+    """Density of the table's step at t, and what `sample_transmittance` would give with this t."""
+    if segments.column is None:
+        length = jnp.maximum(segments.t1 - segments.t0, 0.0)
+        pdf = sampling.sample_truncated_exponential_pdf(t - segments.t0, sigma, length)
+        return jnp.ones_like(t), jnp.where(length > 0, 1.0 / jnp.maximum(pdf, 1e-30), 0.0)
+    total = segments.column[-1]
+    pdf = sampling.sample_truncated_exponential_pdf(column_at(segments, t), sigma, total)
+    step, _ = _step_of(segments, t)
+    lanes = jnp.arange(total.shape[0])
+    before = jnp.where(step > 0, segments.column[jnp.maximum(step - 1, 0), lanes], 0.0)
+    length = jnp.maximum(segments.t1 - segments.t0, 1e-30)
+    density = (segments.column[step, lanes] - before) * (segments.column.shape[0] / length)
+    return density, jnp.where(total > 0, 1.0 / jnp.maximum(pdf, 1e-30), 0.0)
 
 
 def no_surface(mesh: Mesh, n: int) -> materials.Surface:

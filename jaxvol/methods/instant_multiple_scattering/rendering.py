@@ -14,9 +14,12 @@ from jaxvol import camera as pinhole
 from jaxvol import layers, materials, media, ray_casting, sampling
 from jaxvol.methods.instant_multiple_scattering import (
     compensation,
+    eye_rays,
+    gathering,
     light_paths,
     maps,
     ray_lights,
+    selection,
     stages,
     upsampling,
     virtual_lights,
@@ -28,7 +31,7 @@ from jaxvol.methods.instant_multiple_scattering.virtual_lights import LightSet
 from jaxvol.types import Camera, Estimate, Scene
 
 _PIXEL = sampling.stream("instant_multiple_scattering.pixel")
-_STRATA = 4  # of a pixel, each way
+_TRACED = "traced."  # before the names of lights from which some were chosen
 _BAND = 1 << 17  # pixels that are reconstructed at once
 _TERMS = ("surface", "volume", "multiple")
 NAMES = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in _TERMS)
@@ -74,6 +77,31 @@ def make_context(
     return context, counts
 
 
+def select_lights(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    *,
+    seed: int,
+    lights: LightSet | None = None,
+    sizes: dict[str, int] | None = None,
+) -> tuple[LightSet, dict[str, int]]:
+    """Trace a set of lights (or take the one given) and keep about `plan.max_lights`, those that the picture sees most.
+
+    Counts "num_traced" lights before the choice. Updates `sizes` with those of the whole set.
+    """
+    caster = ray_casting.caster_for(scene.mesh, kind=plan.caster)
+    counts: dict[str, int] = {}
+    if lights is None:
+        before = None if sizes is None else {name[len(_TRACED) :]: n for name, n in sizes.items() if name.startswith(_TRACED)}
+        lights, counts = trace_lights(scene, caster, plan, seed=seed, sizes=before)
+        counts["num_traced"] = counts["num_lights"]
+        if sizes is not None:
+            sizes.update({_TRACED + name: n for name, n in virtual_lights.sizes(lights).items()})
+    found = selection.select(scene, caster, camera, lights, plan, seed=seed, sizes=sizes)
+    return found, {**counts, "num_lights": virtual_lights.num_lights(found)}
+
+
 def gather_rays(
     context: Context,
     origin: Float[Array, "n 3"],
@@ -102,7 +130,7 @@ def _scaled(sums, scale):
 
 
 def _chains(context, points_for, index):
-    """Mean residual over the chains; points_for(chain, number) gives points and throughput of one of `number`."""
+    """Mean residual over the chains; points_for(chain, number, first) gives points and throughput of one of `number`."""
     plan = context.plan
     total = stages.zero_sums(index.shape[0])
     if plan.num_levels == 0:
@@ -111,20 +139,41 @@ def _chains(context, points_for, index):
     if plan.direct_at_vertex:
         kinds.append((plan.num_direct, True, plan.num_chains))
     for number, lit, first in kinds:
-        for chain in range(number):
-            points, throughput = points_for(chain, number)
+
+        def add_chain(chain, total, number=number, lit=lit, first=first):
+            points, throughput = points_for(chain, number, first)
             found = stages.compensate(context, points, throughput, index, chain=first + chain, lit=lit)
-            total = {name: total[name] + found[name] / number for name in total}
+            return {name: total[name] + found[name] / number for name in total}
+
+        if context.scene.mesh is None:
+            total = lax.fori_loop(0, number, add_chain, total)
+        else:  # rays are cast between jitted steps
+            for chain in range(number):
+                total = add_chain(chain, total)
     return total
 
 
 def _volume(context, origin, direction, t, index):
+    if context.scene.mesh is not None:
+        return _volume_in_steps(context, origin, direction, t, index)
+    inputs = context._replace(plan=None, seed=jnp.uint32(context.seed))
+    return _volume_at_once(inputs, origin, direction, t, index, plan=context.plan)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _volume_at_once(context, origin, direction, t, index, *, plan):
+    """Without surfaces nothing is cast, so that all of it is one program."""
+    return _volume_in_steps(context._replace(plan=plan), origin, direction, t, index)
+
+
+def _volume_in_steps(context, origin, direction, t, index):
     segments = stages.segments_of(context, origin, direction, t)
     gathered = stages.gather_segments(context, segments, index)
 
-    def eye(chain, number):
-        u = sampling.uniforms(context.seed, _PIXEL, index, 2)[0]
-        return stages.eye_vertices(context, segments, (u + chain) / number)
+    def eye(chain, number, first):
+        u = sampling.uniforms(context.seed, _PIXEL, index, 2)
+        along, kind = gathering.shifted(u[0], chain / number), gathering.shifted(u[1], 0.5 * chain)
+        return stages.eye_vertices(context, segments, along, kind, index, chain=first + chain)
 
     residual = _chains(context, eye, index)
     return {name: gathered[name] + residual[name] for name in gathered}
@@ -147,7 +196,7 @@ def _surface(context, origin, direction, t, face, index):
     points = Points(hit.position, -direction, nothing, clamp, hit.valid, hit.normal, surface)
     u = sampling.uniforms(context.seed, _PIXEL, index, 3)[0]
     gathered = _scaled(stages.gather_points(context, points, u, stride=1, offset=0), tau)
-    residual = _chains(context, lambda chain, number: (points, tau), index + jnp.uint32(0x40000000))
+    residual = _chains(context, lambda *_: (points, tau), index + jnp.uint32(0x40000000))
     return {name: gathered[name] + residual[name] for name in gathered}
 
 
@@ -165,7 +214,11 @@ def render_set(
     result = {name: np.zeros((number, 3), np.float32) for name in NAMES}
     if not (plan.volume or plan.surface):
         return result, {"num_truncated": 0, "num_lights": 0}
+    traced: dict[str, int] = {}
+    if plan.max_lights is not None:
+        lights, traced = select_lights(scene, camera, plan, seed=seed, lights=lights, sizes=sizes)
     context, counts = make_context(scene, plan, seed=seed, lights=lights, sizes=sizes)
+    counts = {**counts, **traced}
     if sizes is not None:
         found = virtual_lights.sizes(context.lights) if context.rays is None else ray_lights.sizes(context.rays)
         sizes.update(found)
@@ -182,7 +235,7 @@ def _evaluate(context, camera, index, result):
         chosen = index[begin : begin + size]
         lanes = np.full(size, chosen[-1], np.uint32)
         lanes[: len(chosen)] = chosen
-        rays, weight = eye_rays(context, camera, jnp.asarray(lanes))
+        rays, weight = eye_rays.through_pixels(context, camera, jnp.asarray(lanes))
         values = gather_rays(context, *rays)
         for name in NAMES:
             result[name][chosen] = (np.asarray(values[name]) * weight)[: len(chosen)]
@@ -193,7 +246,7 @@ def _from_low_resolution(context, camera, result, counts):
     plan = context.plan
     factor, number = plan.upsample, camera.height * camera.width
     rows, columns = -(-camera.height // factor), -(-camera.width // factor)
-    rays = _block_rays(context, camera, rows, columns, factor)
+    rays = eye_rays.block_rays(context, camera, rows, columns, factor=factor)
     shape = (rows * columns, 3)
     coarse = {name: np.zeros(shape, np.float32) for name in NAMES}
     for begin in range(0, shape[0], plan.tile):
@@ -208,7 +261,7 @@ def _from_low_resolution(context, camera, result, counts):
     for begin in range(0, number, size):
         count = min(size, number - begin)
         pixels = jnp.minimum(jnp.arange(begin, begin + size, dtype=jnp.int32), number - 1)
-        centers, _ = eye_rays(_without_jitter(context), camera, pixels.astype(jnp.uint32))
+        centers, _ = eye_rays.through_pixels(_without_jitter(context), camera, pixels.astype(jnp.uint32))
         guides = upsampling.guides(context.scene, *centers[:4], num_steps=steps)
         guides = _with_mean_source(context, camera, guides, pixels.astype(jnp.uint32))
         options = {"height": camera.height, "width": camera.width, "factor": factor, "pixels": pixels}
@@ -235,7 +288,7 @@ def _with_mean_source(context, camera, guides, pixels):
 @partial(jax.jit, static_argnames="num_steps")
 def _mean_source(scene, camera, index, *, num_steps):
     """1 - exp(-tau), averaged over strata of the pixels."""
-    strata = _STRATA if scene.medium.density is None else _STRATA // 2
+    strata = eye_rays.STRATA if scene.medium.density is None else eye_rays.STRATA // 2
     corner = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
     t = jnp.full(index.shape, jnp.inf, jnp.float32)
     face = jnp.full(index.shape, -1, jnp.int32)
@@ -250,64 +303,6 @@ def _mean_source(scene, camera, index, *, num_steps):
 
 def _without_jitter(context):
     return context._replace(plan=dataclasses.replace(context.plan, jitter=False))
-
-
-def _block_rays(context, camera, rows, columns, factor):
-    """Eye rays through the middle of blocks of factor x factor pixels (clamped to the picture)."""
-    index = jnp.arange(rows * columns, dtype=jnp.uint32)
-    xy = (jnp.stack([index % columns, index // columns], axis=-1).astype(jnp.float32) + 0.5) * factor
-    xy = jnp.minimum(xy, jnp.asarray([camera.width - 0.5, camera.height - 0.5]))
-    return cast(context, camera, xy, index)
-
-
-def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"]) -> tuple:
-    """Origins, directions, first hits (t, face) of the eye rays through `xy`, and the given numbers."""
-    rays = pinhole.generate_rays(camera, xy)
-    t = jnp.full(index.shape, jnp.inf, jnp.float32)
-    face = jnp.full(index.shape, -1, jnp.int32)
-    if context.scene.mesh is not None:
-        t, face = ray_casting.intersect(context.caster, rays.origin, rays.direction, t)
-        t, face = jnp.asarray(t), jnp.asarray(face)
-    return rays.origin, rays.direction, t, face, index
-
-
-def eye_rays(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple[tuple, np.ndarray]:
-    """What `gather_rays` takes for rays through pixels, and the weight [n, 1] of their values.
-
-    Without surfaces a jittered ray is one of 16 strata of the pixel, chosen in proportion to 1 - exp(-length * mean
-    extinction) inside the medium: a pixel at the medium's edge is then not hit or missed by chance.
-    """
-    index = jnp.asarray(index)
-    xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
-    if not context.plan.jitter:
-        return cast(context, camera, xy + 0.5, index), np.float32(1.0)
-    if context.scene.mesh is not None or context.scene.medium is None:
-        inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
-        return cast(context, camera, xy + inside, index), np.float32(1.0)
-    chosen, weight = choose_in_pixel(context.scene, camera, xy, index, context.seed)
-    return cast(context, camera, chosen, index), np.asarray(weight)[:, None]
-
-
-@jax.jit
-def choose_in_pixel(
-    scene: Scene, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"], seed: UInt[Array, ""]
-) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
-    """A place in each pixel (its upper left corner is `xy`) by how much medium lies behind it, and 1 / (16 p)."""
-    u = sampling.uniforms(seed, _PIXEL, index, 0)
-    strata = jnp.arange(_STRATA * _STRATA)
-    corner = jnp.stack([strata % _STRATA, strata // _STRATA], axis=-1)
-    inside = (corner + jnp.stack(u[:2], axis=-1)[:, None]) / _STRATA
-    places = xy[:, None] + inside
-    rays = pinhole.generate_rays(camera, places)
-    t0, t1 = media.box_interval(scene.medium.bounds, rays.origin, rays.direction)
-    density = 1.0 if scene.medium.density is None else jnp.mean(scene.medium.density)
-    share = -jnp.expm1(-(t1 - t0) * density * jnp.mean(media.sigma_t(scene.medium)))
-    cumulative = jnp.cumsum(share, axis=1)
-    total = cumulative[:, -1]
-    pick = jnp.minimum(jnp.sum(cumulative < (u[2] * total)[:, None], axis=1), strata.size - 1)
-    lanes = jnp.arange(index.shape[0])
-    weight = jnp.where(total > 0, total / strata.size / jnp.maximum(share[lanes, pick], 1e-30), 0.0)
-    return places[lanes, pick], weight
 
 
 def render(

@@ -9,13 +9,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float, UInt
+from jaxtyping import Array, ArrayLike, Float, UInt
 from scipy.spatial import cKDTree
 
 from jaxvol import lights as primary
 from jaxvol import media, ray_casting, sampling
-from jaxvol.methods.instant_multiple_scattering import compensation, gathering, maps, picking, ray_lights, receivers
+from jaxvol.methods.instant_multiple_scattering import (
+    compensation,
+    gathering,
+    maps,
+    picking,
+    ray_lights,
+    receivers,
+    virtual_lights,
+)
 from jaxvol.methods.instant_multiple_scattering.maps import Maps
 from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.ray_lights import RaySet
@@ -24,6 +31,7 @@ from jaxvol.methods.instant_multiple_scattering.virtual_lights import ORIGIN, Li
 from jaxvol.types import Medium, Scene
 
 _EYE = sampling.stream("instant_multiple_scattering.eye")
+_SHARE = sampling.stream("instant_multiple_scattering.share")
 _CHAIN = sampling.stream("instant_multiple_scattering.chain")
 _RECURRENCE = (0.8566749, 0.7338919, 0.6287067, 0.5385973)  # powers of 1/1.1673040 (Roberts 2018, four dimensions)
 _REDUCED = 0.25  # of the clamp distance: a bound 16 times higher
@@ -39,7 +47,7 @@ class Context(NamedTuple):
     lights: LightSet
     mip: Float[Array, "x y z"] | None
     plan: Plan
-    seed: int
+    seed: ArrayLike  # uint32
     marched: Medium | None  # what pairs march through: the medium, or a coarse copy of it
     maps: Maps | None = None
     rays: RaySet | None = None  # in the place of the lights
@@ -173,20 +181,20 @@ def _between(context, picks, position, origin, name, block, *, stride=1, offset=
     return visible, columns
 
 
-def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, stride: int, offset: int) -> Sums:
+def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, stride: int, offset: ArrayLike) -> Sums:
     """Clamped (points.clamp None: unclamped) light of one of `stride` virtual lights, weighted up, at points."""
     plan, medium = context.plan, context.scene.medium
     sums = zero_sums(u.shape[0])
     for name, block in blocks(context.lights):
         if stride > 1:
-            block = subset(block, jnp.int32(offset % stride), stride=stride)
+            block = virtual_lights.subset(block, jnp.int32(offset % stride), stride=stride)
         if not plan.costly:
             value = gathering.gather_points(points, block, medium, grey=plan.grey, isotropic=plan.isotropic)
         else:
             picks = picking.pick_for_points(
                 points, u, block, medium, num_groups=_groups(block, plan.group_size), isotropic=plan.isotropic
             )
-            origin = lifted(context.scene, points)
+            origin = receivers.lifted(context.scene, points)
             between = _between(context, picks, points.position, origin, name, block, stride=stride, offset=offset)
             value = picking.evaluate_points(
                 points, picks, *between, block, medium, context.marched, isotropic=plan.isotropic, num_steps=plan.pair_steps
@@ -195,40 +203,31 @@ def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, str
     return sums
 
 
-@jax.jit
-def lifted(scene: Scene, points: Points) -> Float[Array, "n 3"]:
-    """Points, those on surfaces moved off them to the side of `outgoing`."""
-    if points.on_surface is None:
-        return points.position
-    moved = ray_casting.offset_origin(
-        points.position, points.normal, points.outgoing, scale=ray_casting.scene_scale(scene.mesh)
-    )
-    return jnp.where(points.on_surface[:, None], moved, points.position)
+def eye_vertices(
+    context: Context,
+    segments: Segments,
+    u: Float[Array, "n"],
+    u_kind: Float[Array, "n"],
+    index: UInt[Array, "n"],
+    *,
+    chain: Array,
+) -> tuple[Points, Float[Array, "n 3"]]:
+    """One point of each eye ray by transmittance, and its weight: what carries the residual there to the eye.
 
-
-@partial(jax.jit, static_argnames="stride")
-def subset(lights: VirtualLights, offset: Array, *, stride: int) -> VirtualLights:
-    """Every `stride`-th light from `offset` on, weighted up: unbiased when `offset` is uniform in 0 ... stride - 1."""
-
-    def thin(x):
-        return x.reshape(x.shape[0] // stride, stride, *x.shape[1:])[:, offset]
-
-    scaled = jax.tree.map(thin, lights)
-    specular = None if scaled.specular is None else scaled.specular * stride
-    return VirtualLights(scaled.position, scaled.direction, scaled.strength * stride, scaled.normal, specular, scaled.exponent)
-
-
-def eye_vertices(context: Context, segments: Segments, u: Float[Array, "n"]) -> tuple[Points, Float[Array, "n 3"]]:
-    """One point of each eye ray by transmittance, and its weight: what carries the residual there to the eye."""
-    return _eye_vertices(context.scene, context.mip, segments, u, plan=context.plan)
+    Near a light in the medium every other point (`u_kind` < 0.5) is chosen towards the light that the chain will use.
+    """
+    u_light = _chain_uniforms(context.seed, index, jnp.int32(0), jnp.int32(chain))[6:9]
+    return _eye_vertices(context.scene, context.mip, segments, u, u_kind, u_light, plan=context.plan)
 
 
 @partial(jax.jit, static_argnames="plan")
-def _eye_vertices(scene, mip, segments, u, *, plan):
+def _eye_vertices(scene, mip, segments, u, u_kind, u_light, *, plan):
     medium = scene.medium
     extinction = media.sigma_t(medium)
     sigma = jnp.mean(extinction)
-    t, inverse_pdf = receivers.sample_transmittance(segments, u, sigma)
+    light = primary.sample_light(scene, segments.origin, *u_light).position
+    near = jnp.all((light > medium.bounds[0]) & (light < medium.bounds[1]), axis=-1)
+    t, inverse_pdf = receivers.sample_transmittance_or_light(segments, u, u_kind < 0.5, sigma, light, near)
     position = segments.origin + t[:, None] * segments.direction
     column = receivers.column_at(segments, t)
     throughput = inverse_pdf[:, None] * jnp.exp(-column[:, None] * extinction)
@@ -249,7 +248,7 @@ def compensate(
     throughput: Float[Array, "n 3"],
     index: UInt[Array, "n"],
     *,
-    chain: int,
+    chain: ArrayLike,
     lit: bool,
 ) -> Sums:
     """The residual of clamping at points (section 4.3), through `num_levels` new vertices one after the other.
@@ -296,8 +295,9 @@ def _gather_at_end(context, points, u, chain, level):
     plan = context.plan
     if level == plan.num_levels - 1 and plan.end != "clamped":
         points = with_clamp(points, None if plan.end == "unclamped" else _REDUCED * points.clamp)
-    choice = np.random.default_rng([context.seed & 0xFFFFFFFF, chain, level])
-    offset = int(choice.integers(plan.light_stride))
+    mixed = jnp.uint32(context.seed) ^ jnp.uint32(_SHARE)
+    hashed = sampling.pcg4d(jnp.uint32(chain), jnp.uint32(level), jnp.uint32(0), mixed)[0]
+    offset = (hashed % jnp.uint32(plan.light_stride)).astype(jnp.int32)
     return gather_points(context, points, u, stride=plan.light_stride, offset=offset)
 
 

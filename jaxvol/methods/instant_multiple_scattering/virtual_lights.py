@@ -1,6 +1,7 @@
 """Virtual point lights: the vertices of light paths, sorted by what they contribute to, ready for the gather kernels."""
 
 import math
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -123,3 +124,15 @@ def sizes(lights: LightSet) -> dict[str, int]:
 def num_lights(lights: LightSet) -> int:
     """Capacity of all blocks together: the number of lights that a full gather evaluates."""
     return sum(block.position.shape[0] for _, block in blocks(lights))
+
+
+@partial(jax.jit, static_argnames="stride")
+def subset(lights: VirtualLights, offset: Array, *, stride: int) -> VirtualLights:
+    """Every `stride`-th light from `offset` on, weighted up: unbiased when `offset` is uniform in 0 ... stride - 1."""
+
+    def thin(x):
+        return x.reshape(x.shape[0] // stride, stride, *x.shape[1:])[:, offset]
+
+    scaled = jax.tree.map(thin, lights)
+    specular = None if scaled.specular is None else scaled.specular * stride
+    return VirtualLights(scaled.position, scaled.direction, scaled.strength * stride, scaled.normal, specular, scaled.exponent)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.methods.instant_multiple_scattering import gathering, picking
+from jaxvol.methods.instant_multiple_scattering import gathering, picking, receivers
 from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
 from tests.methods.instant_multiple_scattering.scenes import floats, make_medium
@@ -142,3 +142,31 @@ def test_gradients_are_finite_with_a_light_on_the_ray(segments, lights):
 
     gradients = jax.grad(value, argnums=(0, 1))(on_ray, jnp.float32(0.0))
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in gradients)
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+def test_eye_vertices_towards_a_light_keep_the_integral(tracked):
+    """Mean of weight * f(t) over both halves = integral of density f, for a light beside the ray; and with less noise."""
+    n = 1 << 15
+    u = (jnp.arange(n, dtype=jnp.float32) + 0.5) / n
+    t0, t1 = jnp.full(n, 1.0), jnp.full(n, 4.0)
+    rays = (jnp.zeros((n, 3)), jnp.tile(jnp.float32([[1.0, 0.0, 0.0]]), (n, 1)), t0, t1, None)
+    steps = np.linspace(0.2, 1.4, 48)  # density of the table's steps
+    column = jnp.asarray(np.cumsum(steps)[:, None] * (3.0 / 48) * np.ones(n), jnp.float32) if tracked else None
+    segments = receivers.Segments(*rays, column)
+    light = jnp.tile(jnp.float32([[2.2, 0.05, 0.0]]), (n, 1))
+    near = jnp.ones(n, bool)
+
+    def values(half, u):
+        t, w = receivers.sample_transmittance_or_light(segments, u, jnp.full(n, half), jnp.float32(0.8), light, near)
+        return np.asarray(w / jnp.sqrt((t - 2.2) ** 2 + 0.05**2), np.float64)
+
+    x = 1.0 + 3.0 * (np.arange(48 * 4096) + 0.5) / (48 * 4096)
+    density = np.repeat(steps, 4096) if tracked else 1.0
+    exact = 3.0 * np.mean(density / np.hypot(x - 2.2, 0.05))
+    both = np.concatenate([values(False, u), values(True, u)])
+    assert both.mean() == pytest.approx(exact, rel=2e-3)
+    plain = receivers.sample_transmittance(segments, u, jnp.float32(0.8))
+    bare = np.asarray(plain[1] / jnp.sqrt((plain[0] - 2.2) ** 2 + 0.05**2))
+    assert bare.mean() == pytest.approx(exact, rel=5e-3)
+    assert both.std() < 0.5 * bare.std()

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering import ray_lights, rendering
-from tests.methods.instant_multiple_scattering.scenes import floats, lit, make_camera, make_medium
-from tests.methods.instant_multiple_scattering.test_render import EXACT
+from jaxvol.methods.instant_multiple_scattering import ray_lights
+from tests.methods.instant_multiple_scattering.scenes import EXACT, lit, make_camera, make_medium, radiance_past_the_source
 
 
 def vector(*values):
@@ -39,25 +38,9 @@ def test_points_on_a_flight_have_their_pdf(start):
 
 def test_infinite_medium():
     """The same exact radiance that the virtual points are tested with; no clamping, no compensation."""
-    medium = make_medium(sigma_s=(0.9,) * 3, sigma_a=(0.1,) * 3, half=20.0)
-    scene = lit(medium, position=(0.0, 1.0, 0.0))
-    plan = ims.plan(scene, make_camera(), num_paths=512, lights="rays", jitter=False)
-    lanes = 64
-    rays = (
-        jnp.tile(floats([-3.0, 0.0, 0.0]), (lanes, 1)),
-        jnp.tile(floats([1.0, 0.0, 0.0]), (lanes, 1)),
-        jnp.full(lanes, 6.0),
-        jnp.full(lanes, -1),
-        jnp.arange(lanes, dtype=jnp.uint32),
-    )
-    values = []
-    for k in range(32):
-        context, _ = rendering.make_context(scene, plan, seed=k)
-        found = rendering.gather_rays(context, *rays)
-        values.append(float(jnp.mean(found["volume_from_volume"] + found["volume_from_multiple"])))
-    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    mean, error = radiance_past_the_source(sets=32, lights="rays")
     assert error < 0.02 * EXACT
-    assert abs(np.mean(values) - EXACT) < 3.5 * error
+    assert abs(mean - EXACT) < 3.5 * error
 
 
 def test_grids_and_surfaces_are_refused():

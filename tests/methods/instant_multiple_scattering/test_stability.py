@@ -1,17 +1,22 @@
 """The specification's stability table (section 7): every pitfall has a test here or, where it says so, elsewhere.
 
-Light on the shading point, value and gradient: `test_gathering`. HG at g -> 1, 0 and negative: `test_pairs`. Truncated
-paths at albedo 1, empty grids: `test_light_paths`.
+Light on the shading point, value and gradient: `test_gathering`. HG's value at g -> 1, 0 and negative: `test_pairs`.
+Truncated paths at albedo 1, empty grids, batches of another shape: `test_light_paths`. The skip list: `test_skipping`.
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import layers, sampling
+from jaxvol import layers, lights, phase, sampling
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering import compensation, light_paths, pairs, rendering
+from jaxvol.methods.instant_multiple_scattering import compensation, gathering, light_paths, pairs, rendering, virtual_lights
+from jaxvol.methods.instant_multiple_scattering.receivers import Points
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
+from jaxvol.types import Scene
 from tests.methods.instant_multiple_scattering.scenes import floats, lit, make_camera, make_medium
 
 SMALL = {"num_paths": 64, "num_levels": 2, "num_chains": 1, "num_direct": 1, "tile": 64}
@@ -93,19 +98,82 @@ def test_gradients_through_sampling_are_finite_at_the_edges():
         assert all(bool(jnp.isfinite(x)) for x in gradients)
 
 
-def test_lights_and_levels_that_scenes_do_not_need_are_skipped():
-    """Static flags of the skip list: no medium, no surfaces, homogeneous, g = 0, albedo 0, optically thin."""
-    camera = make_camera(8)
-    words = {
-        "no surfaces": make_medium(),
-        "homogeneous": make_medium(),
-        "g = 0": make_medium(),
-        "grey": make_medium(),
-        "scatters nothing": make_medium(sigma_s=(0.0,) * 3),
-        "optically thin": make_medium(sigma_s=(0.01,) * 3, sigma_a=(0.0,) * 3),
-    }
-    for word, medium in words.items():
-        assert any(word in reason for reason in ims.plan(lit(medium), camera).skipped), word
-    assert any("no medium" in reason for reason in ims.plan(lit(None), camera).skipped)
-    plan = ims.plan(lit(make_medium(g=0.5)), camera)
-    assert not plan.isotropic and not plan.costly and plan.grey
+def test_directions_stay_unit_vectors_for_lights_close_to_far_rays():
+    """Lights at 0 to 1e-3 from a ray that began 300 away: |delta|^2 - t^2 would cancel there, the cosine exceed one."""
+    n = 4096
+    rng = np.random.default_rng(3)
+    direction = pairs.components(jnp.tile(floats([0.6, 0.64, 0.48]), (n, 1)))
+    aside = rng.normal(size=(n, 3)) * (10.0 ** rng.uniform(-9, -3, (n, 1)))
+    place = pairs.components(jnp.asarray(300.0 * np.array([0.6, 0.64, 0.48]) + aside, jnp.float32))
+    t, perpendicular, h2 = pairs.closest(pairs.components(jnp.zeros((n, 3))), direction, place)
+    assert float(jnp.min(h2)) >= 0.0
+    for offset in (0.0, 1e-4, -2.0):
+        inverse = 1.0 / np.sqrt(np.maximum(np.asarray(h2) + offset * offset, 1e-20))
+        towards = [(offset * np.asarray(w) - np.asarray(p)) * inverse for w, p in zip(direction, perpendicular, strict=True)]
+        length = np.sqrt(sum(x * x for x in towards))
+        assert length.max() < 1 + 1e-3
+        assert np.isfinite(np.asarray(pairs.henyey_greenstein(jnp.asarray(towards[0]), jnp.float32(0.7)))).all()
+
+
+@pytest.mark.parametrize("g", [0.999, 0.99, 0.3, 0.0, -0.9])
+def test_sampled_cosines_have_mean_g(g):
+    """Mean of the sampled cosine is g to 3e-3, and its derivative by g at 0 is 1."""
+    u = (jnp.arange(1 << 16, dtype=jnp.float32) + 0.5) / (1 << 16)
+    mean = lambda x: jnp.mean(phase.sample_henyey_greenstein(u, x))  # noqa: E731
+    assert float(mean(jnp.float32(g))) == pytest.approx(g, abs=3e-3)
+    if g == 0.0:
+        assert float(jax.grad(mean)(jnp.float32(0.0))) == pytest.approx(1.0, rel=1e-3)
+
+
+def test_gradient_through_tracing_and_gathering():
+    """d/d(density) by forward differentiation through flights and gather = a central difference with the same numbers."""
+    n, bounces = 256, 4
+    walls = (jnp.full(n, jnp.inf), jnp.full(n, -1, jnp.int32))
+    receiver = Points(floats([0.7, 0.2, 0.1]), floats([1.0, 0.0, 0.0]), floats([0.8] * 3), floats(0.3))
+
+    def radiance(scale):
+        medium = make_medium(sigma_s=(0.8,) * 3, sigma_a=(0.2,) * 3, g=0.3, half=30.0)
+        medium = dataclasses.replace(medium, sigma_s=medium.sigma_s * scale, sigma_a=medium.sigma_a * scale)
+        scene, seed = lit(medium), jnp.uint32(5)
+        walkers = light_paths.emit(scene, jnp.arange(n, dtype=jnp.uint32), seed)
+        step = lambda state, _: light_paths.step(scene, state, *walls, seed)  # noqa: E731
+        _, rows = jax.lax.scan(step, walkers, None, length=bounces)
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+        strength = jnp.where(flat.valid[:, None], flat.incident * medium.sigma_s / n, 0.0)
+        found = VirtualLights(flat.position, flat.direction, strength)
+        return jnp.mean(gathering.gather_points(receiver, found, medium, grey=True, isotropic=False))
+
+    _, slope = jax.jvp(radiance, (jnp.float32(1.0),), (jnp.float32(1.0),))
+    h = 4e-3
+    difference = (float(radiance(jnp.float32(1 + h))) - float(radiance(jnp.float32(1 - h)))) / (2 * h)
+    assert float(slope) == pytest.approx(difference, rel=1e-2)
+
+
+def test_furnace():
+    """Albedo 1 under a sky of radiance 1: every ray sees 1, so light scattered twice or more is 1 - tau - single.
+
+    Single scattering by quadrature: nodes along the ray, directions of a Fibonacci sphere, distances out of the box.
+    """
+    medium = make_medium(sigma_s=(1.0,) * 3, sigma_a=(0.0,) * 3)
+    scene = Scene(medium=medium, environment=lights.environment_light(np.ones((8, 16, 3))))
+    nodes, weights = np.polynomial.legendre.leggauss(48)
+    k = np.arange(4000) + 0.5
+    z, angle = 1 - 2 * k / 4000, np.pi * (1 + 5**0.5) * k
+    sphere = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=-1)
+    place = np.stack([nodes, 0.3 + 0 * nodes, 0 * nodes], axis=-1)
+    out = np.min((np.sign(sphere)[None] - place[:, None]) / sphere[None], axis=-1)
+    single = np.sum(weights * np.exp(-(1 + nodes)) * np.exp(-out).mean(axis=1))
+    exact = 1 - np.exp(-2.0) - single
+    plan = ims.plan(scene, make_camera(8), num_paths=1024, jitter=False)
+    lanes = 64
+    rays = (jnp.tile(floats([-3.0, 0.3, 0.0]), (lanes, 1)), jnp.tile(floats([1.0, 0.0, 0.0]), (lanes, 1)))
+    rest = (jnp.full(lanes, jnp.inf), jnp.full(lanes, -1), jnp.arange(lanes, dtype=jnp.uint32))
+    values, sizes = [], {}
+    for seed in range(24):
+        context, _ = rendering.make_context(scene, plan, seed=seed, sizes=sizes)
+        sizes.update(virtual_lights.sizes(context.lights))
+        found = rendering.gather_rays(context, *rays, *rest)
+        values.append(float(jnp.mean(found["volume_from_volume"] + found["volume_from_multiple"])))
+    error = np.std(values, ddof=1) / np.sqrt(len(values))
+    assert error < 0.012 * exact
+    assert abs(np.mean(values) - exact) < 3.5 * error

@@ -1,0 +1,72 @@
+"""Eye rays: through pixels, jittered or not, and through blocks of pixels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt
+
+from jaxvol import camera as pinhole
+from jaxvol import media, ray_casting, sampling
+from jaxvol.methods.instant_multiple_scattering.stages import Context
+from jaxvol.types import Camera, Scene
+
+_PIXEL = sampling.stream("instant_multiple_scattering.pixel")
+STRATA = 4  # of a pixel, each way
+
+
+def block_rays(context: Context, camera: Camera, rows: int, columns: int, *, factor: int) -> tuple:
+    """Eye rays through the middle of blocks of factor x factor pixels (clamped to the picture)."""
+    index = jnp.arange(rows * columns, dtype=jnp.uint32)
+    xy = (jnp.stack([index % columns, index // columns], axis=-1).astype(jnp.float32) + 0.5) * factor
+    xy = jnp.minimum(xy, jnp.asarray([camera.width - 0.5, camera.height - 0.5]))
+    return cast(context, camera, xy, index)
+
+
+def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"]) -> tuple:
+    """Origins, directions, first hits (t, face) of the eye rays through `xy`, and the given numbers."""
+    rays = pinhole.generate_rays(camera, xy)
+    t = jnp.full(index.shape, jnp.inf, jnp.float32)
+    face = jnp.full(index.shape, -1, jnp.int32)
+    if context.scene.mesh is not None:
+        t, face = ray_casting.intersect(context.caster, rays.origin, rays.direction, t)
+        t, face = jnp.asarray(t), jnp.asarray(face)
+    return rays.origin, rays.direction, t, face, index
+
+
+def through_pixels(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple[tuple, np.ndarray]:
+    """What `gather_rays` takes for rays through pixels, and the weight [n, 1] of their values.
+
+    Without surfaces a jittered ray is one of 16 strata of the pixel, chosen in proportion to 1 - exp(-length * mean
+    extinction) inside the medium: a pixel at the medium's edge is then not hit or missed by chance.
+    """
+    index = jnp.asarray(index)
+    xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
+    if not context.plan.jitter:
+        return cast(context, camera, xy + 0.5, index), np.float32(1.0)
+    if context.scene.mesh is not None or context.scene.medium is None:
+        inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
+        return cast(context, camera, xy + inside, index), np.float32(1.0)
+    chosen, weight = choose_in_pixel(context.scene, camera, xy, index, context.seed)
+    return cast(context, camera, chosen, index), np.asarray(weight)[:, None]
+
+
+@jax.jit
+def choose_in_pixel(
+    scene: Scene, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"], seed: UInt[Array, ""]
+) -> tuple[Float[Array, "n 2"], Float[Array, "n"]]:
+    """A place in each pixel (its upper left corner is `xy`) by how much medium lies behind it, and 1 / (16 p)."""
+    u = sampling.uniforms(seed, _PIXEL, index, 0)
+    strata = jnp.arange(STRATA * STRATA)
+    corner = jnp.stack([strata % STRATA, strata // STRATA], axis=-1)
+    inside = (corner + jnp.stack(u[:2], axis=-1)[:, None]) / STRATA
+    places = xy[:, None] + inside
+    rays = pinhole.generate_rays(camera, places)
+    t0, t1 = media.box_interval(scene.medium.bounds, rays.origin, rays.direction)
+    density = 1.0 if scene.medium.density is None else jnp.mean(scene.medium.density)
+    share = -jnp.expm1(-(t1 - t0) * density * jnp.mean(media.sigma_t(scene.medium)))
+    cumulative = jnp.cumsum(share, axis=1)
+    total = cumulative[:, -1]
+    pick = jnp.minimum(jnp.sum(cumulative < (u[2] * total)[:, None], axis=1), strata.size - 1)
+    lanes = jnp.arange(index.shape[0])
+    weight = jnp.where(total > 0, total / strata.size / jnp.maximum(share[lanes, pick], 1e-30), 0.0)
+    return places[lanes, pick], weight
