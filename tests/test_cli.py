@@ -148,6 +148,17 @@ def test_explain(fake, scene, tmp_path, capsys):
     assert "does not compute surface_from_light" in printed
 
 
+def test_the_lattice_warns_of_coarse_voxels_and_of_a_solve_that_ended_early(scene, tmp_path, capsys):
+    options = ["--method", "lattice_boltzmann", "--set", "medium.scattering=20"]
+    own = ["resolution=8", "max_applications=1", "surface_rays=0", "tolerance=1e-6", "samples_per_pixel=1"]
+    for key in own:
+        options += ["--set", f"render.lattice_boltzmann.{key}"]
+    assert run("render", scene, "--out", tmp_path, *options) == 0
+    told = capsys.readouterr().err
+    assert "warning: sigma_t' h = 5 is coarse for the lattice; resolution = 40 brings it to 1" in told
+    assert "warning: the solve did not converge, residual" in told
+
+
 def test_pixels_that_are_not_finite_end_with_status_1(monkeypatch, scene, tmp_path, capsys):
     monkeypatch.setattr(rendering, "load_method", lambda name: fake_method(jnp.nan))
     assert run("render", scene, "--out", tmp_path) == 1

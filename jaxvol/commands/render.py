@@ -90,6 +90,9 @@ def _report_job(result: rendering.Rendering, stopped: bool) -> None:
         known = math.isfinite(found["error"])
         error = f"{float(found['error']):.2%}" if known else "unknown"
         _say(f"error {error} (standard error of 8 x 8 blocks over the mean) with {spent}")
+    for line in result.skipped:
+        if "warning:" in line:
+            _say(line)
     if not bool(found.get("converged", True)):
         _say(f"warning: the solve did not converge, residual {float(np.max(found['residual'])):.1e}; allow more applications")
     if stopped:
