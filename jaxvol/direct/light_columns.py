@@ -67,7 +67,7 @@ def light_columns(marching: MarchingMedium, direction: Float[Array, "3"], *, per
     )
     length = step * np.linalg.norm(shear)
     return LightColumns(
-        corners=media.pack_corners(grid * jnp.float32(length)),
+        corners=media.pack_corners(_unbent(grid) * jnp.float32(length)),
         bounds=jnp.asarray(np.stack([begin, end]), jnp.float32),
         origin=jnp.asarray(origin, jnp.float32),
         shear=jnp.asarray(shear, jnp.float32),
@@ -113,6 +113,27 @@ def _sum_layers(marching, begin, spacing, origin, shear, signed_step, *, axis, c
     empty = jnp.zeros(first.shape, jnp.float32)
     _, sums = lax.scan(layer, empty, jnp.arange(count[axis] - 1, dtype=jnp.float32))
     return jnp.moveaxis(jnp.concatenate([empty[None], sums]), 0, axis)
+
+
+@jax.jit
+def _unbent(grid):
+    """Columns whose straight lines between nodes are right on average: those through a bent curve lie on one side of it.
+
+    By a twelfth of the second difference along each axis, the smallest of three neighbours that agree in sign: at a face of
+    the box columns have a kink, and straight lines are exact there.
+    """
+    total = grid
+    for axis in range(3):
+        if grid.shape[axis] < 5:
+            continue
+        values = jnp.moveaxis(grid, axis, 0)
+        bend = values[2:] - 2.0 * values[1:-1] + values[:-2]
+        three = bend[:-2], bend[1:-1], bend[2:]
+        least = jnp.minimum(jnp.minimum(*map(jnp.abs, three[:2])), jnp.abs(three[2]))
+        agree = (three[0] * three[1] > 0.0) & (three[1] * three[2] > 0.0)
+        change = jnp.where(agree, jnp.sign(three[1]) * least, 0.0) / 12.0
+        total = total - jnp.moveaxis(jnp.pad(change, ((2, 2), (0, 0), (0, 0))), 0, axis)
+    return jnp.maximum(total, 0.0)
 
 
 def optical_thickness(columns: LightColumns, medium: Medium, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

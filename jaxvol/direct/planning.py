@@ -102,7 +102,7 @@ def plan(
     # A map with a sun in it needs more directions than a sky of one radiance; without a grid they cost little.
     is_map = scene.environment is not None and scene.environment.radiance.shape[:2] != (1, 1)
     if num_sky_directions is None:
-        num_sky_directions = 384
+        num_sky_directions = 512
     if not (volume and _has_field(scene, camera)):
         num_sky_directions = 0
     if num_environment_samples is None:

@@ -197,14 +197,19 @@ def add_samples(
         try:
             for begin in range(0, len(jobs), shares):
                 parts = [pool.submit(trace, number) for number in range(begin, begin + shares)]
-                for part in wait(parts, return_when=FIRST_EXCEPTION).done:
-                    part.result()  # raises what the part raised
+                _raise_first(parts)
                 (first, count), _, _ = jobs[begin]
-                for part in parts:  # in order, so that a render repeats to the last bit
-                    add_batch(film[first : first + count], part.result(), plan.groups)
+                while parts:  # in order, so that a render repeats to the last bit; films as large as these are let go
+                    add_batch(film[:, :, first : first + count], parts.pop(0).result(), plan.groups)
                 done[begin : begin + shares] = [1.0] * shares
         finally:
             leaving.set()  # after an error or Ctrl-C the other threads need not finish their shares
+
+
+def _raise_first(parts):
+    """Wait for all parts, or raise what the first to fail raised."""
+    for part in wait(parts, return_when=FIRST_EXCEPTION).done:
+        part.result()
 
 
 def host_threads() -> int:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvol.jobs import Parts, Stop
 from jaxvol.methods.path_tracing.estimate import Plan, add_samples, lanes_for
-from jaxvol.methods.path_tracing.film import TOTAL, empty_film, film_to_layers, to_estimate
+from jaxvol.methods.path_tracing.film import empty_film, to_estimate, total_moments
 from jaxvol.types import Camera, Estimate, Scene
 
 _BLOCK = 8  # pixels: errors are told over blocks of this size
@@ -164,13 +164,13 @@ def block_error(film: np.ndarray, plan: Plan, num_samples: int, shape: tuple[int
     """
     if num_samples < 2:
         return math.inf
-    mean, variance = film_to_layers(film, plan.groups, num_samples, only=TOTAL)
+    mean, variance = total_moments(film, plan.groups, num_samples)
     height, width = (size - size % _BLOCK if size >= _BLOCK else size for size in shape)
     rows, columns = max(height // _BLOCK, 1), max(width // _BLOCK, 1)
-    cut = variance[TOTAL].reshape(*shape, 3)[:height, :width].astype(np.float64)
+    cut = variance.reshape(*shape, 3)[:height, :width].astype(np.float64)
     pixels = (height // rows) * (width // columns)
     sums = cut.reshape(rows, height // rows, columns, width // columns, 3).sum(axis=(1, 3))
-    average = float(mean[TOTAL].mean(dtype=np.float64))
+    average = float(mean.mean(dtype=np.float64))
     return float(np.sqrt(sums).mean() / pixels / average) if average > 0 else 0.0
 
 
