@@ -4,7 +4,7 @@ SCENE ?= experiments/scenes/cornell_fog.toml
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: install render pictures test test-slow lint clean
+.PHONY: install render pictures benchmark stress test test-slow lint clean
 
 install: $(INSTALLED)
 
@@ -14,14 +14,20 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
 	touch $@
 
-render: $(INSTALLED)  ## a fog-filled Cornell box (or SCENE=file.toml) into out/
-	$(BIN)/jaxvol render $(SCENE) --out out
+render: $(INSTALLED)  ## a fog-filled Cornell box (or SCENE=file.toml) by the methods that suit it, the reference beside it, into out/
+	$(BIN)/jaxvol render $(SCENE) --method auto --beside path_tracing --out out
 
 pictures: $(INSTALLED)  ## the README's pictures
 	for scene in cornell_fog cloud plume; do \
 		$(BIN)/jaxvol render experiments/scenes/$$scene.toml --out out/pictures || exit 1; \
 		cp out/pictures/$$scene.png docs/images/; \
 	done
+
+benchmark: $(INSTALLED)  ## run time against error over five scenes: table, curves, plots into out/benchmark
+	$(BIN)/jaxvol benchmark experiments/benchmark_small.toml --out out/benchmark
+
+stress: $(INSTALLED)  ## 500 random scenes and the extremes through every method
+	$(BIN)/jaxvol stress --out out/stress
 
 test: $(INSTALLED)  ## the suite without its slow statistical part
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile

@@ -18,7 +18,7 @@ _LIFTED = ("converged", "residual", "stopped")  # diagnostics that the command l
 FIRST = ("emission", "surface_from_light", "volume_from_light")
 ALLOW = "allow it with render.allow_partial = true"
 THICK = 3.0  # optical thickness, reduced by the mean cosine, from which a lattice is the right tool
-PEAKED = 0.9  # mean cosine from which virtual lights want too many paths
+PEAKED = 0.5  # mean cosine from which virtual lights are dearer than paths (experiments/benchmark_small.toml)
 
 Claims = Callable[[str], tuple[Claim, ...]]  # of a method, by name, for the scene at hand
 
@@ -152,11 +152,13 @@ def preferences(scene: Scene) -> list[tuple[str, tuple[str, ...], str]]:
     order.append(("deep_screen_space", ("volume_from_surface",), "light from surfaces scattered once: splatted surfels"))
     if reduced >= THICK:
         order.append(("lattice_boltzmann", VOLUME, f"{what}: a lattice settles in a few sweeps"))
-    if abs(float(medium.g)) < PEAKED:
-        order.append(("instant_multiple_scattering", NAMES, f"{what}: light paths are shared by all pixels"))
-        why = "no fast method computes it here"
-    else:
+    if abs(float(medium.g)) >= PEAKED:
         why = f"mean cosine {float(medium.g):.2g}: virtual lights would be seen one by one"
+    elif medium.density is not None and scene.mesh is not None:
+        why = "a grid among surfaces: virtual lights would march and cast a ray each, and cost more than paths"
+    else:
+        order.append(("instant_multiple_scattering", NAMES, f"{what}: light paths are shared by all pixels"))
+        why = "no fast method computes it completely here"
     return [*order, ("path_tracing", NAMES, why)]
 
 

@@ -1,0 +1,202 @@
+"""Scenes on purpose and by chance: their forms are what they say, the checks find what they look for, physics stays finite."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxvol import media, phase, transmittance
+from jaxvol.layers import items
+from jaxvol.methods.deep_screen_space import kernel
+from jaxvol.scene import make_scene
+from jaxvol.stress import checks, driver, extremes, scenes
+from jaxvol.types import Layers, Medium
+
+FEW = settings(max_examples=60, deadline=None)
+
+
+# --- scenes
+
+
+def test_every_scene_is_taken_in_every_form():
+    for number in range(3 * len(scenes.CLASSES)):
+        name, config = scenes.random_scene(number)
+        assert name == tuple(scenes.CLASSES)[number % len(scenes.CLASSES)]
+        for form in (
+            config,
+            scenes.in_units(config, 2.0**17),
+            scenes.turned(config, np.ones(3)),
+            scenes.with_light(config, 4.0),
+        ):
+            make_scene(form)
+    names = [name for name, config in extremes.extremes() if make_scene(config)]
+    assert len(names) == len(set(names)) > 40
+
+
+def test_a_class_is_one_structure():
+    """Floats differ, shapes do not: hundreds of scenes share a few compilations."""
+    for name in scenes.CLASSES:
+        forms = {jax.tree.structure(make_scene(scenes.draw(name, np.random.default_rng(seed))).scene) for seed in range(4)}
+        assert len(forms) <= 2, name  # majorant grids may have two sizes
+
+
+def test_turning_four_times_is_no_turn():
+    _, config = scenes.random_scene(2)
+    turned = config
+    for _ in range(4):
+        turned = scenes.turned(turned, np.zeros(3))
+    a, b = make_scene(config).scene, make_scene(turned).scene
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(np.asarray(x), np.asarray(y), rtol=1e-5, atol=1e-6)
+
+
+# --- checks
+
+
+def test_checks_find_what_they_look_for():
+    good = Layers(emission=jnp.ones((2, 2, 3)))
+    assert checks.sound(good) is None
+    assert "not finite" in checks.sound(Layers(emission=jnp.full((2, 2, 3), jnp.nan)))
+    assert "least value -1" in checks.sound(Layers(emission=-jnp.ones((2, 2, 3))))
+    assert checks.differs(np.ones(4), np.ones(4)) is None and "0.1" in checks.differs(np.ones(4), np.full(4, 0.9))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        (lambda config, seed: config["lights"][0]["intensity"].sum() ** 2, "light x 4"),
+        (lambda config, seed: np.linalg.norm(config["camera"]["origin"]), "lengths x"),
+        (lambda config, seed: 1.0 + abs(config["camera"]["origin"][0]) + 1e-3 * seed, "turned"),
+    ],
+)
+def test_a_wrong_method_is_caught(monkeypatch, wrong, complaint):
+    """Methods that are not linear, not free of units, not the same for a turned scene."""
+    rendered = lambda config, method, seed=0: Layers(emission=jnp.full((2, 2, 3), float(wrong(config, seed))))  # noqa: E731
+    monkeypatch.setattr(checks, "render", rendered)
+    config = scenes.draw("fog_point", np.random.default_rng(1))
+    config["lights"][0]["intensity"] = np.ones(3)
+    found = driver.run_case(config, 0, "fog_point", "any")
+    assert any(complaint in line for line in found["failed"])
+
+
+def test_light_from_nothing_is_caught(monkeypatch):
+    monkeypatch.setattr(checks, "render", lambda config, method, seed=0: Layers(emission=jnp.full((2, 2, 3), 1.1)))
+    config = scenes.draw("fog_furnace", np.random.default_rng(1))
+    assert any("furnace: mean 1.1" in line for line in driver.run_case(config, 8, "fog_furnace", "any")["failed"])
+
+
+def test_a_crash_is_a_failure_and_a_refusal_is_none(monkeypatch):
+    def crash(config, method, seed=0):
+        raise IndexError("out of range")
+
+    config = scenes.draw("fog_point", np.random.default_rng(1))
+    monkeypatch.setattr(checks, "render", crash)
+    assert driver.run_case(config, 0, "fog_point", "any")["failed"] == ["raised IndexError: out of range"]
+    monkeypatch.undo()
+    assert "mesh is missing" in driver.run_case(config, 0, "fog_point", "impulse_response")["refused"]
+
+
+def test_a_stopped_run_goes_on(tmp_path, monkeypatch):
+    calls = []
+
+    def run_case(config, number, name, method):
+        calls.append(number)
+        return {"failed": [], "passed": ["sound"], "seconds": 0.0}
+
+    monkeypatch.setattr(driver, "run_case", run_case)
+    first = driver.run(tmp_path, first=0, num=3, methods=("direct",))
+    again = driver.run(tmp_path, first=0, num=5, methods=("direct",))
+    assert len(again) == len(first) + 2 == len(calls)
+    assert "direct" in driver.table(again) and not driver.failures(again)
+
+
+@pytest.mark.parametrize("method", ("direct", "deep_screen_space"))
+def test_the_worst_of_the_past(method):
+    """Scenes in which methods once failed: tiny units, lights beside the eye ray, a cloud too thick for any sample."""
+    found = dict(extremes.extremes())
+    worst = ("scene scale 1e-06, fog", "optical depth 1e+06, grid")
+    for name in worst:
+        record = driver.run_case(found[name], None, "extreme", method)
+        assert not record["failed"], (name, record["failed"])
+
+
+# --- physics at the ends of its ranges: values and gradients
+
+
+def tiny_medium(sigma, g, density=None):
+    density = None if density is None else jnp.asarray(density, jnp.float32)
+    return Medium(
+        bounds=jnp.asarray([[-1.0] * 3, [1.0] * 3]),
+        sigma_s=jnp.full(3, 0.5 * sigma, jnp.float32),
+        sigma_a=jnp.full(3, 0.5 * sigma, jnp.float32),
+        g=jnp.float32(g),
+        density=density,
+        majorants=None if density is None else media.majorants(density),
+    )
+
+
+@FEW
+@given(st.floats(-0.999, 0.999), st.floats(-1.0, 1.0))
+def test_henyey_greenstein_is_finite_with_its_gradient_and_right(g, cosine):
+    value, slope = jax.value_and_grad(phase.henyey_greenstein, argnums=1)(jnp.float32(cosine), jnp.float32(g))
+    a, c = float(np.float32(g)), float(np.float32(cosine))
+    exact = (1 - a * a) / (4 * np.pi * (1 + a * a - 2 * a * c) ** 1.5)
+    assert np.isfinite(value) and np.isfinite(slope)
+    assert abs(float(value) / exact - 1) < 5e-3  # at g = .999 float32 holds 1 - g to 6e-5
+
+
+@FEW
+@given(st.floats(-12, 6), st.floats(0, 8), st.integers(0, 5))
+def test_columns_are_finite_with_their_gradients(exponent, contrast, seed):
+    """Optical depth 1e-12 .. 1e6 through a grid of any contrast: float32 against float64, and d/d sigma, d/d density."""
+    rng = np.random.default_rng(seed)
+    density = (10.0 ** -(contrast * rng.random((3, 3, 3)))).astype(np.float32)
+    medium = tiny_medium(10.0**exponent, 0.0, density)
+    origin, direction = jnp.asarray([[-2.0, 0.1, 0.2]]), jnp.asarray([[1.0, 0.0, 0.0]])
+
+    def through(sigma, grid):
+        found = tiny_medium(1.0, 0.0, density)
+        object.__setattr__(found, "density", grid)
+        options = {"num_steps": 64}
+        column = transmittance.density_column(found, origin, direction, jnp.zeros(1), jnp.full(1, 4.0), **options)
+        return jnp.sum(jnp.exp(-sigma * column))
+
+    sigma = jnp.float32(np.mean(np.asarray(media.sigma_t(medium))))
+    value, (by_sigma, by_density) = jax.value_and_grad(through, argnums=(0, 1))(sigma, jnp.asarray(density))
+    assert 0 <= float(value) <= 1 and np.isfinite(by_sigma) and np.isfinite(np.asarray(by_density)).all()
+    assert float(by_sigma) <= 0
+    x = np.linspace(-2, 2, 20001)
+    inside = np.abs(x) < 1
+    points = np.stack([x[inside], np.full(inside.sum(), 0.1), np.full(inside.sum(), 0.2)], axis=-1)
+    fine = np.asarray(media.density(medium, jnp.asarray(points, jnp.float32)), np.float64)
+    exact = np.exp(-float(sigma) * fine.mean() * 2)
+    assert abs(float(value) - exact) < 2e-2 * max(1.0, -np.log(max(exact, 1e-30))) * exact + 1e-6
+
+
+@FEW
+@given(st.floats(-0.999, 0.999), st.floats(-6, 6), st.floats(-6, 2))
+def test_the_pair_kernel_is_finite_with_its_gradient(g, log_distance, log_area):
+    """A surfel at any distance from the sample, also on it, of any size, any g."""
+    d = jnp.full((1, 1), 10.0**log_distance)
+    area = 10.0**log_area
+
+    def value(g, d):
+        row = dict(
+            zip(kernel.COLUMNS, (0.0, 0.0, 0.0, 0.6, 0.0, 0.8, 0.0, np.inf, area / 2 / np.pi, 1.0, 1.0, 1.0), strict=True)
+        )
+        row = {name: jnp.full((1, 1), v, jnp.float32) for name, v in row.items()}
+        ray = tuple(jnp.full((1, 1), v, jnp.float32) for v in (0.0, 0.0, 1.0))
+        return jnp.sum(kernel.pair_samples(ray, [d], row, phase="henyey_greenstein", g=g)[0])
+
+    found, slopes = jax.value_and_grad(value, argnums=(0, 1))(jnp.float32(g), d)
+    assert np.isfinite(found) and float(found) >= 0
+    assert all(np.isfinite(np.asarray(x)).all() for x in slopes)
+
+
+def test_layers_of_an_empty_scene_are_sound():
+    """No light at all: exact zeros, everywhere."""
+    config = dict(extremes.extremes())["no light"]
+    for name, image in items(checks.render(config, "direct")):
+        assert float(np.abs(np.asarray(image)).max()) == 0.0, name
