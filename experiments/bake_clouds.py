@@ -18,6 +18,8 @@ from jaxvol.scene import load_scene
 SCENE = Path(__file__).resolve().parent / "scenes" / "les_cumulus.toml"
 MODES = {
     "ours, marched": {},
+    "one marched leg": {"legs": 1},
+    "sixteen marched legs": {"legs": 16},
     "never marched": {"contrast": None},
     "attenuated only": {"scattering": "attenuated"},
     "surface-only": {"scattering": "surface"},
@@ -42,7 +44,7 @@ def main():
     scene = load_scene(SCENE).scene
     points, normals = receivers(arguments.size)
     config = {"size": arguments.size, "samples": arguments.samples}
-    parts = jobs.Parts(arguments.out / "bake_clouds.parts", config=config, restart=False)
+    parts = jobs.Parts(arguments.out / f"bake_clouds_{arguments.size}_{arguments.samples}.parts", config=config)
     done = parts.get("reference")
     if done is None:
         truth, variance, straight = traced(scene, points, normals, arguments.samples)

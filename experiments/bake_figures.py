@@ -45,9 +45,9 @@ def errors(name, found, reference, variance):
     return row
 
 
-def traced(scene, points, normals, samples, *, batch=16):
+def traced(scene, points, normals, samples, *, seed=0):
     """Path-traced irradiance: (everything, its variance, what came straight from the sources)."""
-    found = path_tracing.irradiance(scene, points + 1e-4 * normals, normals, samples=samples)
+    found = path_tracing.irradiance(scene, points + 1e-4 * normals, normals, samples=samples, seed=seed)
     parts = list(found.variance.sums.values())
     return np.asarray(layers.total(found.mean)), np.asarray(parts[0]), np.asarray(found.mean.emission)
 
@@ -85,8 +85,8 @@ def canyon_file(width, *overrides):
 
 def street(out, quick):
     """Like Figure 1: a street with lamps in fog, lit without the medium, with attenuated light, and with all of it."""
-    file = canyon_file(120 if quick else 240)
-    samples = 4 if quick else 24
+    file = canyon_file(120 if quick else 200)
+    samples = 4 if quick else 16
     pictures = {
         "surface-only bake": view(file.scene, file.camera, samples=samples, scattering="surface"),
         "attenuated only": view(file.scene, file.camera, samples=samples, scattering="attenuated"),
@@ -107,7 +107,11 @@ def heterogeneous(out, quick):
     place = (np.arange(size) + 0.5) / size * 6 - 3
     points = np.stack([*np.meshgrid(place, place, indexing="xy"), np.zeros((size, size))], axis=-1).astype(np.float32)
     normals = np.broadcast_to(np.float32([0, 0, 1]), points.shape)
-    truth, variance, straight = traced(scene, points, normals, 512 if quick else 4096)
+    halves = [traced(scene, points, normals, 512 if quick else 4096, seed=seed) for seed in (0, 1)]
+    truth, straight = (0.5 * (halves[0][i] + halves[1][i]) for i in (0, 2))
+    variance = 0.25 * (halves[0][1] + halves[1][1])
+    own = [half[0] - half[2] for half in halves]
+    spread = np.square(0.5 * (own[0] - own[1]))  # of scattered light, whose layer has no variance of its own
     pictures, rows = {"truth (path tracing)": truth}, []
     scattered = {"truth, scattered alone": truth - straight}
     for name, options in (("ours, segments marched", {}), ("paper: mean of each segment", PAPER)):
@@ -123,7 +127,7 @@ def heterogeneous(out, quick):
             f"{name}, scattered alone",
             scattered[f"{name}, scattered alone"].reshape(-1, 3),
             (truth - straight).reshape(-1, 3),
-            variance.reshape(-1, 3),
+            spread.reshape(-1, 3),
         )
         rows.append(light | {"marched_share": share})
     write_csv(out / "bake_heterogeneous.csv", rows)
@@ -192,7 +196,7 @@ def probe_lit(out, quick):
         ("attenuated", "attenuated"),
         ("with light scattered in the fog", "multiple"),
     ):
-        plan = impulse_response.plan(file.scene, None, scattering=mode, max_bounces=3)
+        plan = impulse_response.plan(file.scene, None, scattering=mode, max_bounces=3, image=False)  # probes are no surfaces
         found = baking.bake(
             impulse_response.prepare(file.scene, plan), plan, points, normals, name=mode, samples=8 if quick else 64
         )
@@ -212,7 +216,7 @@ def _smooth_normals(mesh, points, faces):
 
 def homogeneous(out, quick):
     """Figure 12: attenuated light alone against everything, with the eye rays' scattering by `direct`; lamps, then a sun."""
-    width, samples = (100, 4) if quick else (200, 24)
+    width, samples = (100, 4) if quick else (160, 16)
     lamps = canyon_file(width)
     sun = make_sun(lamps)
     pictures = {}

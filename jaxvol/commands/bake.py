@@ -57,6 +57,7 @@ def bake(
     contrast: Annotated[
         float | None, typer.Option(help="Of density, above which a segment is marched; 1 = never.", min=0, max=1)
     ] = None,
+    legs: Annotated[int, typer.Option(help="Scatter points of a marched segment before the tables.", min=1)] = 4,
     similarity: Annotated[bool, typer.Option(help="Multiple scattering by similarity to an isotropic medium.")] = False,
     g_range: Annotated[float | None, typer.Option(help="Single scattering interpolated between three values of g.")] = None,
     harmonics: Annotated[bool, typer.Option(help="SH of incident light in the lightmap's channels.")] = True,
@@ -77,7 +78,7 @@ def bake(
         options |= {"similarity": True, "g_range": 0.5 if g_range is None else g_range}
     else:
         options |= {"image": image_source, "back_scattering": back_scattering, "occlusion": occlusion.value}
-        options |= {"similarity": similarity, "g_range": g_range}
+        options |= {"similarity": similarity, "g_range": g_range, "legs": legs}
         if contrast is not None:
             options["contrast"] = contrast if contrast < 1 else None
     plan = impulse_response.plan(file.scene, None, **options)
@@ -109,7 +110,8 @@ def bake(
         with jobs.stoppable() as stop, jobs.progress(f"bake {file.name}", total=total) as advance:
             for target, (_, points, normals) in jobs_of.items():
                 results[target] = baking.bake(
-                    kit,
+                    # A probe stands in the medium: no surface stops the light that comes back to it.
+                    dataclasses.replace(kit, image=kit.image and target is not Target.probes),
                     dataclasses.replace(plan, harmonics=harmonics and target is Target.lightmap),
                     points,
                     normals,

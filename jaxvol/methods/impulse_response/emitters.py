@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxvol.methods.impulse_response import lookup, shading
 from jaxvol.methods.impulse_response.lookup import Pick, Responses
-from jaxvol.methods.impulse_response.receivers import Receiver
+from jaxvol.methods.impulse_response.receivers import Receiver, like
 from jaxvol.sampling import dot
 
 EXTRAPOLATION = 0.6  # transport mean free paths
@@ -77,6 +77,19 @@ def point_arrivals(
     return first, rest
 
 
+def slab_share(
+    kappa: Float[Array, "C"], tau: Float[Array, "n 3"], below: Float[Array, "n 3"] | float, transport: Float[Array, "3"]
+) -> Float[Array, "n 3"]:
+    """Fluence in a slab lit from above over that in the half-space of the tables, by diffusion with extrapolated boundaries.
+
+    At depth tau, `below` (optical) over the slab's lower face: sinh(kappa (below + z)) / sinh(kappa (tau + below + 2 z)) over
+    exp(-kappa (tau + z)), z the extrapolation. A half-space of no absorption stays lit at any depth, a slab loses light below.
+    """
+    z = EXTRAPOLATION / transport
+    rate = 2 * jnp.maximum(kappa, 1e-3)
+    return jnp.expm1(-rate * (below + z)) / jnp.expm1(-rate * (tau + below + 2 * z))
+
+
 def directional_arrivals(
     responses: Responses,
     receiver: Receiver,
@@ -88,7 +101,8 @@ def directional_arrivals(
 ) -> Arrivals:
     """Scattered light of a directional light of irradiance 1 from `direction`; tau of the way out of the medium, RGB.
 
-    The medium is taken as a half-space whose top is perpendicular to the light (specification 2).
+    The medium is taken as a half-space whose top is perpendicular to the light (specification 2), with `image` as a slab that
+    ends at the receiver: an image source would take off more than there is.
     """
     once, more = lookup.directional_source(responses.directional, responses.albedo, tau, pick=pick)
     first = _rgb(receiver.zonal(once, direction))
@@ -96,11 +110,10 @@ def directional_arrivals(
         return first, jnp.zeros_like(first)
     rest = _rgb(receiver.zonal(more, direction))
     if image:
-        cosine = dot(receiver.normal, direction)
-        deeper = tau + 2 * EXTRAPOLATION / responses.transport
-        again, further = lookup.directional_source(responses.directional, responses.albedo, deeper, pick=pick)
-        mirrored = direction - 2 * cosine[:, None] * receiver.normal
-        rest = rest - _where(cosine > 0, _rgb(receiver.zonal(again + further, mirrored)))
+        kappa = jnp.stack([grid.kappa for grid in responses.directional])
+        # Twice the share: on a plane deep inside, half of the fluence comes from below, and there is no below here.
+        share = jnp.minimum(2 * slab_share(kappa, tau, 0.0, responses.transport), 1.0)
+        rest = like(share, rest) * rest
     return first, rest
 
 

@@ -5,6 +5,7 @@ Segments that end at the receivers themselves and are cut by an occluder, or lie
 counted (section 5.2, the paper's rule), as it is at all further vertices.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxvol import extinction, ray_casting, sampling, segments
+from jaxvol import extinction, ray_casting, sampling
 from jaxvol.methods.impulse_response import emitters, light_sources, marched, surface_paths
 from jaxvol.methods.impulse_response.light_sources import DELTA, Light, delta_lights
 from jaxvol.methods.impulse_response.lookup import Responses
@@ -25,6 +26,9 @@ _PICK = sampling.stream("impulse_response.light_lookups")
 _MARCHED = sampling.stream("impulse_response.marched")
 # Segments of the receivers themselves and those marched; lookups and those past the tables' tau; all segments of live paths.
 COUNTS = ("segments", "marched", "lookups", "beyond", "traced")
+
+
+Draw = Callable[[int], tuple[Array, Array, Array, Array]]
 
 
 class Kit(eqx.Module):
@@ -43,6 +47,7 @@ class Kit(eqx.Module):
     shares: tuple[float, float, float] = eqx.field(static=True, default=(1.0, 0.0, 0.0))
     march_occluded: bool = eqx.field(static=True, default=False)
     contrast: float | None = eqx.field(static=True, default=None)  # above it segments are marched; None = never
+    legs: int = eqx.field(static=True, default=1)  # scatter points of a marched segment before the tables
     multiple: bool = eqx.field(static=True, default=True)
     open: bool = eqx.field(static=True, default=False)  # all faces in one plane: nothing occludes
 
@@ -119,66 +124,56 @@ def by_marching(kit: Kit, position, normal, light: Light, visible: np.ndarray) -
     return chosen
 
 
-def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light, chosen: np.ndarray, u):
-    """(once, more often) of the chosen segments by one random scatter point each, zeros elsewhere."""
+def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light, chosen: np.ndarray, draw: Draw):
+    """(once, more often) of the chosen segments by one random walk of `kit.legs` scatter points each, zeros elsewhere.
+
+    `draw(i)` gives the i-th four random numbers of every segment.
+    """
     rows = np.flatnonzero(chosen)
-    if rows.size == 0:
+    count, num = rows.size, chosen.shape[0]
+    if count == 0:
         zero = jnp.zeros(jax.eval_shape(receiver.straight, light.direction, light.strength).shape, jnp.float32)
         return zero, zero
-    num = chosen.shape[0]
-    lanes = max(num // 8, 1) if rows.size <= num // 8 else num  # two sizes, so two compilations
-    rows = np.concatenate([rows, np.full(lanes - rows.size, rows[0])])
-    part, position, index, u, seen = jax.tree.map(
-        lambda x: x[rows] if jnp.shape(x)[:1] == (num,) else x, (receiver, position, index, u, light)
-    )
-    where = marched.place(kit.marching, position, part.normal, seen, u, num_steps=kit.num_steps)
-    points = position + where.distance[:, None] * where.direction
+    lanes = max(num // 8, 1) if count <= num // 8 else num  # two sizes, so two compilations
+    rows = np.concatenate([rows, np.full(lanes - count, rows[0])])
+    take = partial(jax.tree.map, lambda x: x[rows] if jnp.shape(x)[:1] == (num,) else x)
+    part, position, index, seen = take((receiver, position, index, light))
+    medium, steps = kit.marching.regions[0], kit.num_steps
+    where = marched.place(kit.marching, position, part.normal, seen, take(draw(0)), num_steps=steps)
     start = surface_paths.lifted(position, part.normal, kit.faces.scale)
     reached = ~_occluded(kit, start, where.direction, where.distance)
-    again = light_sources.see_again(kit.scene, position, kind, index, seen, points)
-    lit = ~_occluded(kit, *_shortened(*light_sources.shadow_ray(kit.faces.scale, points, None, again)))
-    near = thickness(kit, position, where.direction, where.distance)
-    far = thickness(kit, points, again.direction, again.distance)
-    density = _density(kit, points)
-    lit, reached = jnp.asarray(lit), jnp.asarray(reached)
-    found = marched.gather(
-        kit.scene.medium,
-        kit.responses,
-        part,
-        where,
-        density,
-        again,
-        reached,
-        lit,
-        near,
-        far,
-        multiple=kit.multiple,
-        image=kit.image,
-    )
-    count = int(chosen.sum())
+    weight = marched.throughput(medium, where, jnp.asarray(reached))
+    points, outward, once, more = position + where.distance[:, None] * where.direction, where.direction, None, 0.0
+    for leg in range(1, kit.legs + 1):
+        again = light_sources.see_again(kit.scene, position, kind, index, seen, points)
+        lit = jnp.asarray(~_occluded(kit, *light_sources.shadow_ray(kit.faces.scale, points, None, again)))
+        far = thickness(kit, points, again.direction, again.distance)
+        radiance = weight * marched.scattered_once(medium, outward, again, lit, far)
+        once, more = (radiance, more) if once is None else (once, more + radiance)
+        if not kit.multiple:
+            break
+        if leg == kit.legs:
+            around = marched.surroundings(medium, where, part.normal, points - position)
+            arguments = (medium, kit.responses, outward, again, lit, far, part.normal, *around)
+            more = more + weight * marched.scattered_more(*arguments, image=kit.image)
+        else:
+            outward, distance, factor = marched.onward(kit.marching, points, outward, take(draw(leg)), num_steps=steps)
+            open_way = ~_occluded(kit, points, outward, distance)
+            weight = weight * factor * jnp.asarray(open_way)[:, None]
+            points = points + distance[:, None] * outward
+    found = _to_receiver(part, where.direction, once, jnp.zeros_like(once) if not kit.multiple else more)
     return tuple(_scatter(value, rows[:count], num) for value in found)
+
+
+@jax.jit
+def _to_receiver(receiver, direction, once, more):
+    return receiver.straight(direction, once), receiver.straight(direction, more)
 
 
 def _scatter(value, rows, num):
     whole = np.zeros((num, *value.shape[1:]), np.float32)
     whole[rows] = np.asarray(value)[: rows.size]
     return jnp.asarray(whole)
-
-
-def _shortened(origin, direction, length):
-    return origin, direction, length * (1 - 1e-5)
-
-
-def _density(kit, points):
-    medium = kit.scene.medium
-    if segments.is_box(medium):
-        return extinction.region_density(kit.marching, 0, points)
-    region = np.asarray(segments.region_at(medium, points, casters=kit.medium_casters))
-    total = jnp.zeros(points.shape[0], jnp.float32)
-    for number in range(len(kit.marching.regions)):
-        inside = jnp.asarray(region == number)
-        total = jnp.where(inside, extinction.region_density(kit.marching, number, points), total)
-    return total
 
 
 def light_from(
@@ -191,18 +186,17 @@ def light_from(
     *,
     own: bool,
     tally: Tally,
-    marching_u=None,
+    draw: Draw | None = None,
     pick=None,
     smooth: bool = True,
 ) -> tuple[Array, Array, Array, Array]:
     """Light of one emitter of a kind at each receiver: attenuated, once, more often, once but occluded and dropped.
 
-    `pick` chooses single nodes of the tables. `own`: the receivers are those of the bake, whose segments may be marched: with
-    the numbers `marching_u`, or left out where None. `smooth` False leaves out what `marching_u` None gives: the two add up.
+    `pick` chooses single nodes of the tables. `own`: the receivers are those of the bake, whose segments may be marched: by
+    the random numbers `draw`, or left out where None. `smooth` False leaves out what `draw` None gives: the two add up.
     """
     light = light_sources.see(kit.scene, position, kind, index, u)
-    ray = _shortened(*light_sources.shadow_ray(kit.faces.scale, position, receiver.normal, light))
-    visible = ~_occluded(kit, *ray)
+    visible = ~_occluded(kit, *light_sources.shadow_ray(kit.faces.scale, position, receiver.normal, light))
     by_march = own and kit.marches
     chosen = by_marching(kit, position, receiver.normal, light, visible) if by_march else None
     direct = once = more = lost = None
@@ -219,8 +213,8 @@ def light_from(
             lost = jnp.zeros_like(direct)
         if own and kit.responses is not None:
             tally.count(segments=visible.size, marched=0 if chosen is None else int(chosen.sum()))
-    if chosen is not None and marching_u is not None:
-        found = march(kit, receiver, position, kind, index, light, chosen, marching_u)
+    if chosen is not None and draw is not None:
+        found = march(kit, receiver, position, kind, index, light, chosen, draw)
         if not smooth:
             return jnp.zeros_like(found[0]), *found, jnp.zeros_like(found[0])
         once, more = once + found[0], more + found[1]
@@ -259,17 +253,32 @@ def sampled_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed,
     kinds += ["area"] if kit.scene.area_lights is not None else []
     kinds += ["environment"] if kit.scene.environment is not None else []
     for number, kind in enumerate(kinds):
-        u = sampling.uniforms(seed, _STREAM, item, 8 * depth + number, sample)
-        again = sampling.uniforms(seed, _MARCHED, item, number, sample) if own and kit.marches else None
-        pick = sampling.uniforms(seed, _PICK, item, 8 * depth + number, sample)[:2]
         count = counts.get(kind, 1)
-        index = jnp.minimum((u[3] * count).astype(jnp.int32), count - 1)
+        u, pick, index = _numbers(seed, item, sample, 8 * depth + number, count)
+        draw = partial(_marching_numbers, seed, item, sample, number) if own and kit.marches else None
         smooth = not (own and kind in DELTA)
-        found = light_from(
-            kit, receiver, position, kind, index, u, own=own, tally=tally, marching_u=again, pick=pick, smooth=smooth
-        )
-        total = [a + count * b for a, b in zip(total, found, strict=True)]
+        found = light_from(kit, receiver, position, kind, index, u, own=own, tally=tally, draw=draw, pick=pick, smooth=smooth)
+        total = _add(total, found, count)
     return tuple(total)
+
+
+@jax.jit
+def _add(total, found, count):
+    return [a + count * b for a, b in zip(total, found, strict=True)]
+
+
+@jax.jit
+def _numbers(seed, item, sample, dimension, count):
+    """Random numbers of one light choice, of its lookup, and the index chosen among `count`."""
+    u = sampling.uniforms(seed, _STREAM, item, dimension, sample)
+    pick = sampling.uniforms(seed, _PICK, item, dimension, sample)[:2]
+    return u, pick, jnp.minimum((u[3] * count).astype(jnp.int32), count - 1)
+
+
+@jax.jit
+def _marching_numbers(seed, item, sample, number, leg):
+    """Four random numbers of one leg of one segment; `number` tells the kinds of emitters apart."""
+    return sampling.uniforms(seed, _MARCHED, item, 8 * leg + number, sample)
 
 
 def _step(kit, receiver, position, item, sample, seed, depth, tally):
@@ -282,7 +291,7 @@ def _step(kit, receiver, position, item, sample, seed, depth, tally):
     arrival = surface_paths.arrive(mesh, kit.faces, position, normal, proposal, t, face, kit.probe_sigma)
     visible = plumb = np.ones(item.shape, bool)
     if kit.shares[0] < 1:  # otherwise the ray itself is the proof
-        visible = ~_occluded(kit, *_shortened(*arrival.between))
+        visible = ~_occluded(kit, *arrival.between)
         plumb = ~_occluded(kit, *arrival.plumb)
     tau = thickness(kit, position, arrival.direction, arrival.distance)
     chosen = response = None
@@ -290,8 +299,8 @@ def _step(kit, receiver, position, item, sample, seed, depth, tally):
         light = Light(arrival.direction, arrival.distance, jnp.ones_like(position), arrival.normal)
         sight = visible | np.asarray(proposal.technique == 0)
         chosen = by_marching(kit, position, normal, light, sight) & np.asarray(arrival.valid)
-        u = sampling.uniforms(seed, _MARCHED, item, 100, sample)
-        once, more = march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, u)
+        draw = partial(_marching_numbers, seed, item, sample, 7)
+        once, more = march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, draw)
         response = once + more
         tally.count(segments=chosen.size, marched=int(chosen.sum()))
     if kit.responses is not None:

@@ -93,4 +93,4 @@ def shadow_ray(scale, position, normal, light: Light):
         end = surface_paths.lifted(end, light.normal, scale)
     way = end - start
     length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-20))
-    return start, way / length[:, None], length
+    return start, way / length[:, None], length * (1 - 1e-5)

@@ -4,12 +4,12 @@ The tables take a segment for homogeneous and open. Where the measured contrast 
 occluder cuts it, the integral over last scatter points z is sampled instead, with both legs marched and tested for
 occluders (specification 4, "correct fallback"):
 
-    int f(w) sigma_s(z) e^-tau(x,z) V(x,z) { p(w, z -> y) e^-tau(z,y) V(z,y) L_e  +  light that the tables bring from y to z,
-    scattered towards x by the phase function } dz
+    int f(w) sigma_s(z) e^-tau(x,z) V(x,z) { p(w, z -> y) e^-tau(z,y) V(z,y) L_e  +  light that reaches z scattered } dz
 
-so light scattered once is right in any medium, and light scattered more often has its last leg right. z is drawn uniformly
-in the half angles at x and y (specification 2) for emitters at a finite distance, which cancels 1/r^2, and by free flight
-along a uniform direction of the hemisphere for light from infinity.
+so light scattered once is right in any medium. The second term goes on from z by the phase function and free flight for
+as many `legs` as the plan says, and takes what is left from the tables at the last of them, scattered by the phase function.
+z is drawn by free flight along a uniform direction of the hemisphere, and for emitters at a finite distance also uniformly
+in the half angles at x and y (specification 2), which fits their 1/r^2; both densities count (balance heuristic).
 """
 
 from functools import partial
@@ -24,82 +24,91 @@ from jaxtyping import Array, Bool, Float
 
 from jaxvol import extinction, harmonics, media, phase, sampling, zonal_lookup
 from jaxvol.methods.impulse_response import lookup, shading
-from jaxvol.methods.impulse_response.emitters import EXTRAPOLATION
+from jaxvol.methods.impulse_response.emitters import EXTRAPOLATION, slab_share
 from jaxvol.methods.impulse_response.light_sources import Light
 from jaxvol.sampling import dot
 
 _AXIS = (np.arange(8) + 0.5) / 8  # places along the segment
-_HALF_ANGLES = np.array([[0.3, 0.3], [0.6, 0.3], [0.3, 0.6], [0.15, 0.15]])  # at receiver and emitter
-_DIRECTIONS = np.array([[0.8, 0.0], [0.8, 0.5], [0.3, 0.25], [0.3, 0.75]])  # cosine about the normal, turn
-_DEPTHS = (0.25, 0.75)  # of the way through the box
+_COSINES, _TURNS, _DEPTHS = (0.9, 0.5, 0.15), 4, (0.125, 0.375, 0.625, 0.875)  # directions about the normal, depths in the box
+
+
+@jax.jit
+def surroundings(medium, where: "Place", normal, offset) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Height of points `offset` from the receiver over its surface, and mean extinction of the leg that reached it."""
+    sigma = jnp.mean(media.sigma_t(medium)) * where.near / jnp.maximum(where.distance, 1e-9)
+    return dot(offset, normal), jnp.maximum(sigma, 1e-6)
 
 
 class Place(NamedTuple):
-    """Where light scatters last: distance along a direction from the receiver; `weight` is 1 / density of t and w over r^2."""
+    """Where light scatters last on its way to a receiver."""
 
-    direction: Float[Array, "n 3"]
+    direction: Float[Array, "n 3"]  # from the receiver
     distance: Float[Array, "n"]
-    weight: Float[Array, "n"]  # dw dt of the sample; at finite distance without the 1/r^2 of the light
+    near: Float[Array, "n"]  # column of density up to there
+    weight: Float[Array, "n"]  # density there over the sample's density in solid angle and distance
 
 
 @jax.jit
 def contrast(
     marching: extinction.MarchingMedium, position: Float[Array, "n 3"], normal: Float[Array, "n 3"], light: Light
 ) -> Float[Array, "n"]:
-    """(max - min) / max of density at 16 places on and around each segment, where its light scatters; 0 where all is empty."""
+    """(max - min) / max of density along each segment and around its receiver, 56 places; 1 where all are empty."""
     medium = marching.regions[0]
 
     def density(points):
         return extinction.region_density(marching, 0, points)
 
-    found = []
     if light.infinite:
         t0, t1 = media.box_interval(medium.bounds, position, light.direction)
-        found += [density(position + (t0 + f * (t1 - t0))[:, None] * light.direction) for f in _AXIS]
-        s, t = sampling.orthonormal_basis(normal)
-        for cosine, turn in _DIRECTIONS:
-            sine = np.sqrt(1 - cosine * cosine)
-            way = cosine * normal + sine * (np.cos(2 * pi * turn) * s + np.sin(2 * pi * turn) * t)
+        found = [density(position + (t0 + f * (t1 - t0))[:, None] * light.direction) for f in _AXIS]
+    else:
+        found = [density(position + (f * light.distance)[:, None] * light.direction) for f in _AXIS]
+    s, t = sampling.orthonormal_basis(normal)
+    for ring, cosine in enumerate(_COSINES):
+        sine = np.sqrt(1 - cosine * cosine)
+        for turn in range(_TURNS):
+            phi = 2 * pi * (turn + 0.5 * (ring % 2)) / _TURNS
+            way = cosine * normal + sine * (np.cos(phi) * s + np.sin(phi) * t)
             t0, t1 = media.box_interval(medium.bounds, position, way)
             for depth in _DEPTHS:
                 inside = density(position + (t0 + depth * (t1 - t0))[:, None] * way)
                 found.append(jnp.where(t1 > t0, inside, 0.0))
-    else:
-        way = light.distance[:, None] * light.direction
-        found += [density(position + f * way) for f in _AXIS]
-        s, t = sampling.orthonormal_basis(light.direction)
-        for number, (a, w) in enumerate(_HALF_ANGLES):
-            for turn in (0.25 * number, 0.25 * number + 0.5):
-                around = np.cos(2 * pi * turn) * s + np.sin(2 * pi * turn) * t
-                reach = light.distance * (np.sin(2 * w) / np.sin(2 * (a + w)))
-                direction = np.cos(2 * a) * light.direction + np.sin(2 * a) * around
-                # Below the receiver's own surface nothing scatters towards it.
-                above = dot(direction, normal) > 0
-                found.append(jnp.where(above, density(position + reach[:, None] * direction), found[0]))
     values = jnp.stack(found)
     high, low = jnp.max(values, axis=0), jnp.min(values, axis=0)
-    return jnp.where(high > 0, (high - low) / jnp.maximum(high, 1e-30), 0.0)
+    return jnp.where(high > 0, (high - low) / jnp.maximum(high, 1e-30), 1.0)
 
 
 @partial(jax.jit, static_argnames="num_steps")
 def place(marching, position, normal, light: Light, u, *, num_steps: int) -> Place:
-    """Draw the last scatter point of each segment."""
+    """Draw the last scatter point of each segment by four random numbers."""
+    ring = jnp.sqrt((1 - u[0]) * (1 + u[0]))
+    direction = sampling.direction_about(normal, u[0], ring, u[1])
     if light.infinite:
-        ring = jnp.sqrt((1 - u[0]) * (1 + u[0]))
-        direction = sampling.direction_about(normal, u[0], ring, u[1])
-        t, weight = _free_flight(marching, position, direction, u[2], num_steps)
-        return Place(direction, t, 2 * pi * weight)
+        t, column, density = _free_flight(marching, position, direction, u[2], num_steps)
+        return Place(direction, t, column, jnp.where(density > 0, 2 * pi / jnp.maximum(density, 1e-30), 0.0))
+    by_angles = u[3] < 0.5
     total = 0.5 * pi * jnp.sqrt(u[0])  # a + w, uniform over the triangle a, w >= 0, a + w <= pi / 2
     a = total * u[1]
-    sine = jnp.maximum(jnp.sin(2 * total), 1e-6)
-    reach, left = light.distance * jnp.sin(2 * (total - a)) / sine, light.distance * jnp.sin(2 * a) / sine
-    direction = sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2])
-    # dt dmu dphi = (4 r^2 / d) da dw dphi, over the triangle's area and all azimuths.
-    return Place(direction, reach, 4 * left * left / jnp.maximum(light.distance, 1e-9) * (pi * pi / 8) * 2 * pi)
+    reach = light.distance * jnp.sin(2 * (total - a)) / jnp.maximum(jnp.sin(2 * total), 1e-6)
+    aside = sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2])
+    direction = jnp.where(by_angles[:, None], aside, direction)
+    t, column, density = _free_flight(
+        marching, position, direction, u[2], num_steps, given=jnp.where(by_angles, reach, jnp.inf)
+    )
+    rest = light.distance[:, None] * light.direction - t[:, None] * direction
+    # dt dmu dphi = (4 r^2 / d) da dw dphi, over the triangle's area and all azimuths; `density` is over density of the medium.
+    angles = light.distance / (4 * jnp.maximum(dot(rest, rest), 1e-12)) / (pi**3 / 4)
+    flight = jnp.where(dot(direction, normal) > 0, density / (2 * pi), 0.0)
+    rho = extinction.region_density(marching, 0, position + t[:, None] * direction)
+    pdf = 0.5 * (angles + flight * rho)
+    return Place(direction, t, column, rho / jnp.maximum(pdf, 1e-30))
 
 
-def _free_flight(marching, origin, direction, u, num_steps):
-    """A distance with density ~ sigma e^-tau of the mean channel inside the box, and 1 / density."""
+def _free_flight(marching, origin, direction, u, num_steps, given=None):
+    """A distance with density ~ rho e^-tau of the mean channel inside the box: (t, column up to it, density / rho).
+
+    Where `given` is finite it is the distance, and the rest is of it.
+    """
     medium = marching.regions[0]
     sigma = jnp.mean(media.sigma_t(medium))
     t0, t1 = media.box_interval(medium.bounds, origin, direction)
@@ -114,16 +123,29 @@ def _free_flight(marching, origin, direction, u, num_steps):
     target = -jnp.log1p(-u * kept) / sigma
 
     def find(i, state):
-        passed, t, there = state
+        passed, t, reached = state
         rho = density(i)
         after = passed + step * rho
         here = (passed <= target) & (after > target)
         t = jnp.where(here, t0 + i * step + (target - passed) / jnp.maximum(rho, 1e-30), t)
-        return after, t, jnp.where(here, rho, there)
+        if given is not None:
+            reached = reached + rho * jnp.clip(given - (t0 + i * step), 0.0, step)
+        return after, t, reached
 
-    _, t, rho = lax.fori_loop(0, num_steps, find, (zero, t0, zero))
-    pdf = sigma * rho * jnp.exp(-sigma * target) / jnp.maximum(kept, 1e-30)
-    return t, jnp.where(pdf > 0, 1 / jnp.maximum(pdf, 1e-30), 0.0)
+    _, t, reached = lax.fori_loop(0, num_steps, find, (zero, t0, zero))
+    if given is not None:
+        t, target = jnp.where(jnp.isinf(given), t, given), jnp.where(jnp.isinf(given), target, reached)
+    return t, target, sigma * jnp.exp(-sigma * target) / jnp.maximum(kept, 1e-30) * (kept > 0)
+
+
+@partial(jax.jit, static_argnames="num_steps")
+def onward(marching, points, direction, u, *, num_steps: int):
+    """The next leg outward from scatter points: (direction, distance, factor of throughput [n, 3])."""
+    medium = marching.regions[0]
+    turned, _ = phase.sample(medium, direction, u[0], u[1])
+    t, column, density = _free_flight(marching, points, turned, u[2], num_steps)
+    through = medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None])
+    return turned, t, through * jnp.where(density > 0, 1 / jnp.maximum(density, 1e-30), 0.0)[:, None]
 
 
 def _phase_lobe(medium, order):
@@ -135,52 +157,57 @@ def _phase_lobe(medium, order):
     return moments * jnp.asarray(harmonics.zonal_norm(order), moments.dtype)
 
 
-@partial(jax.jit, static_argnames=("multiple", "image"))
-def gather(
-    medium,
-    responses: lookup.Responses,
-    receiver,
-    where: Place,
-    density: Float[Array, "n"],
-    light: Light,
-    reached: Bool[Array, "n"],
-    lit: Bool[Array, "n"],
-    near: Float[Array, "n 3"],
-    far: Float[Array, "n 3"],
-    *,
-    multiple: bool,
-    image: bool,
-) -> tuple[Float[Array, "n *rows 3"], Float[Array, "n *rows 3"]]:
-    """What the receiver makes of light scattered last at the places: (once, more often).
+@jax.jit
+def throughput(medium, where: Place, reached: Bool[Array, "n"]) -> Float[Array, "n 3"]:
+    """What a place counts at the receiver per unit of scattered radiance over sigma_s rho; 0 where it is not seen."""
+    found = medium.sigma_s * jnp.exp(-media.sigma_t(medium) * where.near[:, None]) * where.weight[:, None]
+    return jnp.where(reached[:, None], found, 0.0)
 
-    `light` as seen from the places, `reached` and `lit` whether they see receiver and light, near and far the optical
-    thickness of the two legs.
-    """
-    sigma_s = medium.sigma_s * density[:, None]
-    weight = jnp.where(reached[:, None], where.weight[:, None] * sigma_s * jnp.exp(-near), 0.0)
-    # Directions toward light: travel along -light.direction, then along -where.direction.
-    cosine = dot(where.direction, light.direction)
+
+@jax.jit
+def scattered_once(
+    medium, outward: Float[Array, "n 3"], light: Light, lit: Bool[Array, "n"], far: Float[Array, "n 3"]
+) -> Float[Array, "n 3"]:
+    """Radiance over sigma_s that attenuated light leaves against `outward` at points that see the emitter as `light`."""
     source = light.strength
     if light.normal is not None:
         source = source * jnp.maximum(-dot(light.normal, light.direction), 0.0)[:, None]
     if not light.infinite:
         source = source / (light.distance * light.distance)[:, None]
-    once = jnp.where(lit[:, None], source * jnp.exp(-far), 0.0) * phase.evaluate(medium, cosine)[:, None]
-    first = receiver.straight(where.direction, weight * once)
-    if not multiple:
-        return first, jnp.zeros_like(first)
-    brought = _brought(medium, responses, where.direction, light, far)
-    if image:
-        mirrored, thick = _mirrored(responses, receiver.normal, where, light, near, far)
-        taken = _brought(medium, responses, where.direction, mirrored, thick)
-        straight = jnp.exp(-thick) * phase.evaluate(medium, dot(where.direction, mirrored.direction))[:, None]
+    # Directions toward light: it travels along -light.direction, then along -outward.
+    return jnp.where(lit[:, None], source * jnp.exp(-far), 0.0) * phase.evaluate(medium, dot(outward, light.direction))[:, None]
+
+
+@partial(jax.jit, static_argnames="image")
+def scattered_more(
+    medium,
+    responses: lookup.Responses,
+    outward: Float[Array, "n 3"],
+    light: Light,
+    lit: Bool[Array, "n"],
+    far: Float[Array, "n 3"],
+    normal: Float[Array, "n 3"],
+    height: Float[Array, "n"],
+    sigma: Float[Array, "n"],
+    *,
+    image: bool,
+) -> Float[Array, "n 3"]:
+    """As `scattered_once`, of the light that the tables bring to the points.
+
+    With `image` less the emitter's image behind the receiver's surface, `height` below and with extinction `sigma` above it.
+    """
+    brought = _brought(medium, responses, outward, light, far)
+    if image and light.infinite:
+        kappa = jnp.stack([grid.kappa for grid in responses.directional])
+        brought = brought * slab_share(kappa, far, (height * sigma)[:, None], responses.transport)
+    elif image:
+        mirrored, thick = _mirrored(responses, normal, height, sigma, light, far)
+        straight = jnp.exp(-thick) * phase.evaluate(medium, dot(outward, mirrored.direction))[:, None]
         if light.normal is not None:
             straight = straight * jnp.maximum(-dot(mirrored.normal, mirrored.direction), 0.0)[:, None]
-        if not light.infinite:
-            straight = straight / (mirrored.distance * mirrored.distance)[:, None]
-        brought = brought - (taken + straight)
-    more = jnp.where(lit[:, None], jnp.maximum(brought, 0.0), 0.0) * light.strength
-    return first, receiver.straight(where.direction, weight * more)
+        straight = straight / (mirrored.distance * mirrored.distance)[:, None]
+        brought = brought - (_brought(medium, responses, outward, mirrored, thick) + straight)
+    return jnp.where(lit[:, None], jnp.maximum(brought, 0.0), 0.0) * light.strength
 
 
 def _brought(medium, responses, outward, light, tau):
@@ -203,20 +230,13 @@ def _brought(medium, responses, outward, light, tau):
     return shading.half_product(field, lobe, shading.emitter_frame(light.direction, light.normal), outward)
 
 
-def _mirrored(responses, normal, where, light, near, far):
+def _mirrored(responses, normal, height, sigma, light, far):
     """The emitter's image behind the receiver's surface, as the scatter points see it, and its optical thickness.
 
     As in `emitters`, with the extinction of the leg to the receiver: where the medium does not reach the surface, the
     image moves away.
     """
-    height = where.distance * dot(where.direction, normal)  # of the scatter point
-    thickness = jnp.mean(near, axis=-1)
-    sigma = jnp.maximum(thickness / jnp.maximum(where.distance, 1e-9), 1e-6)
     behind = EXTRAPOLATION / (jnp.mean(responses.transport) * sigma)
-    if light.infinite:
-        direction = light.direction - 2 * dot(light.direction, normal)[:, None] * normal
-        deeper = 2 * (height + behind) * sigma
-        return Light(direction, light.distance, light.strength, infinite=True), far + deeper[:, None]
     way = light.distance[:, None] * light.direction
     above = height + dot(way, normal)
     way = way - 2 * (above + behind)[:, None] * normal

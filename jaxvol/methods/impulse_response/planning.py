@@ -26,6 +26,7 @@ class Plan:
     image: bool
     march_occluded: bool  # segments that an occluder cuts are integrated, not dropped
     contrast: float | None  # of density, above which a segment is integrated; None = never
+    legs: int  # scatter points of a marched segment before the tables take over
     similarity: bool
     g_range: float | None
     harmonics: bool  # incident SH beside irradiance
@@ -76,6 +77,7 @@ def plan(
     back_scattering: bool = True,
     occlusion: Occlusion = "march",
     contrast: float | None = CONTRAST,
+    legs: int = 4,
     similarity: bool = False,
     g_range: float | None = None,
     harmonics: bool = False,
@@ -94,6 +96,7 @@ def plan(
             leg by last leg; "drop" is the paper's rule, and its share is reported.
         contrast: of density about a receiver's segment, (max - min) / max, above which it is integrated with marched sigma;
             None = never, the paper's mode.
+        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64.
         similarity: the paper's map of light scattered twice or more to an isotropic medium.
         g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
         harmonics: also bake SH of incident radiance.
@@ -110,6 +113,8 @@ def plan(
         raise ValueError(f"occlusion: {occlusion!r} is not allowed, must be march or drop")
     if contrast is not None and not 0 <= contrast <= 1:
         raise ValueError(f"contrast: {contrast} is not allowed, must be 0 to 1")
+    if not 1 <= legs <= 64:
+        raise ValueError(f"legs: {legs} is not allowed, must be 1 to 64")
     if g_range is not None and not 0 < g_range < 1:
         raise ValueError(f"g_range: {g_range} is not allowed, must lie in (0, 1)")
     if num_lanes < 1:
@@ -157,6 +162,7 @@ def plan(
         image=image and scattering == "multiple",
         march_occluded=scatters and occlusion == "march" and not bare and segments.is_box(medium),
         contrast=contrast if heterogeneous else None,
+        legs=legs,
         similarity=similarity,
         g_range=g_range,
         harmonics=harmonics,
@@ -221,6 +227,7 @@ def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTable
         shares=plan.shares,
         march_occluded=plan.march_occluded,
         contrast=plan.contrast,
+        legs=plan.legs,
         multiple=plan.scattering == "multiple",
         open=plan.open,
     )

@@ -163,7 +163,7 @@ def arrive(
         normal=facing,
         direction=delta / distance[:, None],
         distance=distance,
-        between=(start, way / length[:, None], length),
+        between=(start, way / length[:, None], length * (1 - 1e-5)),
         plumb=(
             position + lateral + (0.25 / probe_sigma) * normal,
             -normal,

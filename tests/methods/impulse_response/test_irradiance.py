@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import layers
+from jaxvol import direct, harmonics, layers
 from jaxvol.methods import impulse_response
+from jaxvol.methods.impulse_response.receivers import Reflection
 from jaxvol.scene import make_scene
 from jaxvol.types import Medium, Mesh, PointLights, Scene, SpotLights
 
@@ -219,3 +220,37 @@ def test_render_takes_the_surface_layers():
     assert picture.shape == (12, 12, 3) and np.all(np.isfinite(picture)) and picture.mean() > 0.02
     for name in layers.SURFACE:
         assert np.asarray(getattr(estimate.mean, name)).mean() > 0, name
+
+
+def test_render_reflects_in_phong_lobes():
+    """Direct light on a glossy floor against `direct`."""
+    table = {
+        "shapes": [{"mesh": "builtin:plane", "reflectance": 0.3, "specular": 0.5, "exponent": 20.0, "transform": {"scale": 50}}]
+    }
+    table["camera"] = {"origin": [0, 2, 3], "target": [0, 0, 0], "fov_y": 30, "width": 8, "height": 8}
+    table["lights"] = [{"kind": "directional", "direction": [0, -1, -0.8], "irradiance": 2.0}]
+    file = make_scene(table)
+    plan = impulse_response.plan(file.scene, file.camera, max_bounces=0)
+    found = impulse_response.render(file.scene, file.camera, plan, samples=8).mean.surface_from_light
+    truth = direct.render(file.scene, file.camera, direct.plan(file.scene, file.camera)).mean.surface_from_light
+    np.testing.assert_allclose(found, truth, rtol=0.05)
+    assert np.ptp(np.asarray(truth)[..., 0]) > 0.1 * np.asarray(truth).mean()  # a highlight is in the picture
+    assert [claim.partial for claim in impulse_response.claims(file.scene)][0] is None
+
+
+def test_phong_lobe_of_scattered_light():
+    """A narrow lobe against quadrature of its BSDF times the cosine, off the normal."""
+    normal, eye = np.array([0.0, 0, 1]), np.array([np.sin(0.6), 0, np.cos(0.6)])
+    axis = 2 * eye[2] * normal - eye
+    mu, weight = np.polynomial.legendre.leggauss(200)
+    phi = np.pi * np.arange(400) / 200
+    sine = np.sqrt(1 - mu * mu)
+    w = np.stack([sine[:, None] * np.cos(phi), sine[:, None] * np.sin(phi), mu[:, None] + 0 * phi], -1)
+    zonal = np.array([1.0, 0.4, 0.2, 0.1, 0.05])
+    light = np.polynomial.legendre.legval(w @ np.array([0.6, 0.0, 0.8]), zonal * harmonics.zonal_norm(5))
+    lobe = 82 / (2 * np.pi) * np.maximum(w @ axis, 0) ** 80 * np.maximum(w @ normal, 0)
+    truth = np.sum(weight[:, None] * light * lobe) * np.pi / 200
+    one = lambda v: jnp.asarray(v, jnp.float32)[None]  # noqa: E731
+    receiver = Reflection(one(normal), one(axis), jnp.zeros((1, 3)), jnp.ones((1, 3)), one(80.0))
+    found = receiver.zonal(one(zonal)[:, None], one([0.6, 0.0, 0.8]))
+    np.testing.assert_allclose(found[0], truth, rtol=0.02)

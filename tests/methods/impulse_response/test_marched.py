@@ -13,8 +13,6 @@ from jaxvol.methods.impulse_response.light_sources import Light
 from jaxvol.types import DirectionalLights, Medium, Mesh
 from tests.methods.impulse_response.test_irradiance import found, open_plane, receivers
 
-# Irradiance beside a wall of height 1.5 at x = 0.5 (REFERENCE_WALL[albedo] = everything at x = 1, 2, 3 behind it), lamp as in
-# test_irradiance: path_tracing.irradiance.
 WALL = np.array([[0.5, -3, 0], [0.5, 3, 0], [0.5, 3, 1.5], [0.5, -3, 1.5]], np.float32)
 
 
@@ -34,7 +32,7 @@ def always(scene, **options):
 def test_marching_a_homogeneous_medium_gives_the_tables_single_scattering(g):
     scene = open_plane(0.9, g)
     looked_up = found(impulse_response.irradiance(scene, *receivers(), samples=1, max_bounces=0), "surface_from_volume")
-    estimate = impulse_response.irradiance(scene, *receivers(), plan=always(scene), samples=6000)
+    estimate = impulse_response.irradiance(scene, *receivers(), plan=always(scene), samples=16384)
     error = np.sqrt(np.asarray(estimate.variance.surface_from_volume)[:, 0])
     assert np.all(np.abs(found(estimate, "surface_from_volume") - looked_up) < 4 * error + 4e-3 * looked_up)
     assert error.sum() < 0.02 * looked_up.sum() and float(estimate.diagnostics["marched_share"]) == 1
@@ -59,16 +57,19 @@ def test_contrast_is_measured_around_segments():
     position = jnp.array([[-1.0, 0, 0], [1.2, 0, 0], [-0.2, 0, 0]])
     light = Light(jnp.array([[0.0, 0, 1]] * 3), jnp.full(3, 0.4), jnp.ones((3, 3)))
     normal = light.direction
-    for medium, expected in ((constant, [0, 0, 0]), (half, [0, 0, 1])):
+    empty = dataclasses.replace(constant, density=jnp.zeros((4, 4, 4)))
+    for medium, expected in ((constant, 0.0), (half, 1.0), (empty, 1.0)):
         found = marched.contrast(extinction.marching_medium(medium), position, normal, light)
-        assert np.all((np.asarray(found) > 0.2) == np.array(expected, bool))
+        np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_a_varying_medium_is_marched_and_a_constant_one_looked_up():
     scene = open_plane(0.9)
-    for density, expected in ((np.ones((4, 4, 4)), 0.0), (np.linspace(0, 1, 64).reshape(4, 4, 4), 1.0)):
+    noise = np.random.default_rng(0).uniform(0, 1, (24, 24, 12))
+    for density, expected in ((np.ones((4, 4, 4)), 0.0), (noise, 1.0)):
         grid = dataclasses.replace(scene.medium, density=jnp.asarray(density, jnp.float32))
-        estimate = impulse_response.irradiance(open_plane(0.9, medium=grid), *receivers(), samples=4, max_bounces=0)
+        varying = open_plane(0.9, medium=grid)
+        estimate = impulse_response.irradiance(varying, *receivers(), samples=4, max_bounces=0, contrast=0.2)
         assert float(estimate.diagnostics["marched_share"]) == expected
     plan = impulse_response.plan(open_plane(0.9, medium=grid), None, contrast=None)
     assert plan.contrast is None
@@ -79,6 +80,8 @@ def test_light_goes_around_a_wall():
     points = points + np.float32([0.01, 0, 0])
     dropped = impulse_response.irradiance(scene, points, normals, samples=1, max_bounces=0, occlusion="drop")
     assert np.all(np.asarray(layers.total(dropped.mean))[2:] == 0)
-    estimate = impulse_response.irradiance(scene, points, normals, samples=8192, max_bounces=0)
-    assert np.all(found(estimate, "surface_from_volume")[2:] > 0)
+    estimate = impulse_response.irradiance(scene, points, normals, samples=16384, max_bounces=0)
+    # path_tracing.irradiance there, 20,000 samples: 9.5e-4 +- .6e-4, 5.2e-4 +- .3e-4, 2.9e-4 +- .4e-4 at 1, 2, 3.
+    total = np.asarray(layers.total(estimate.mean))[2:, 0]
+    assert 0.5 < total.sum() / 1.76e-3 < 1.2
     assert float(estimate.diagnostics["occluded_share"]) == 0
