@@ -1,5 +1,8 @@
 # Everything below works on a fresh machine with Python 3.11 or newer: the first target makes .venv and installs into it.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
+ifndef SCENE  # the picture to start with: small, so that it is there within two minutes, compilation included
+SIZE := --set camera.width=192 --set camera.height=192
+endif
 SCENE ?= experiments/scenes/cornell_fog.toml
 BIN := .venv/bin
 INSTALLED := .venv/.installed
@@ -15,7 +18,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $@
 
 render: $(INSTALLED)  ## a fog-filled Cornell box (or SCENE=file.toml) by the methods that suit it, the reference beside it, into out/
-	$(BIN)/jaxvol render $(SCENE) --method auto --beside path_tracing --out out
+	$(BIN)/jaxvol render $(SCENE) --method auto --beside path_tracing --samples 32 $(SIZE) --out out
 
 pictures: $(INSTALLED)  ## the README's pictures
 	for scene in cornell_fog cloud plume; do \
