@@ -19,7 +19,7 @@ from jaxvol import media
 from jaxvol.extinction import MarchingMedium, region_density
 from jaxvol.types import Medium
 
-_SMALL = 500_000  # cells of the sheared grid that always may be had
+_SMALL = 5_000_000  # cells of the sheared grid that always may be had; eight floats each
 
 
 class LightColumns(eqx.Module):

@@ -109,7 +109,7 @@ def plan(
         num_environment_samples = 40 if is_map else 12
     if num_environment_steps is None:
         cheap = scene.medium is None or (not across and segments.is_box(scene.medium))
-        num_environment_steps = 64 if is_map and cheap else 32
+        num_environment_steps = 64 if is_map and cheap else 48
     if num_bsdf_samples is None:
         num_bsdf_samples = _default_bsdf_samples(scene)
     if num_phase_steps is None:
@@ -121,8 +121,7 @@ def plan(
     if scene.environment is not None and surface and num_environment_samples + num_bsdf_samples == 0:
         raise ValueError("num_environment_samples and num_bsdf_samples must not both be 0 in a scene with an environment")
     if volume_samples_per_pixel is None:
-        # In a grid the sky is marched to, and skies want more samples than lamps.
-        volume_samples_per_pixel = (16 if scene.environment is not None else 8) if across else samples_per_pixel
+        volume_samples_per_pixel = samples_per_pixel
     return Plan(
         emission=emission,
         surface=surface,

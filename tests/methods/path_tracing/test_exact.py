@@ -41,7 +41,7 @@ def source(c):
         (0.5, 2, 61440),
         (0.9, 0, 15360),
         (0.9, 1, 49152),
-        (0.99, 0, 18432),  # a hundred vertices a path
+        pytest.param(0.99, 0, 24576, marks=pytest.mark.timeout(2400)),  # a hundred vertices a path
     ],
 )
 def test_fluence_around_a_point_source(c, place, samples):
@@ -132,7 +132,7 @@ def test_airlight_of_a_point_light(problem):
 T12 = {  # lights, samples of the homogeneous medium and of the grid, options
     "sun": ({"directional_lights": sun([0.6, -0.8, 0.0])}, 20480, 25600, {}),
     "point light inside, scattered once": ({"point_lights": point([0.5, 0.3, 0.5])}, 5120, 10240, {"max_scatterings": 1}),
-    "point light inside": ({"point_lights": point([0.5, 0.3, 0.5])}, 131072, 131072, {}),
+    "point light inside": ({"point_lights": point([0.5, 0.3, 0.5])}, 196608, 131072, {}),
 }
 
 
