@@ -103,7 +103,7 @@ def collisions(name, corrections, tau, albedo, source):
     return h * np.asarray(phi, float).reshape(BLOCKS, k, BLOCKS, k, BLOCKS, k).sum((1, 3, 5))
 
 
-def slab_emission(tau=16.0, albedo=0.9, count=32):
+def slab_emission(tau=16.0, albedo=0.9, count=32, *, forms=(("paper", 0), ("26", 0), ("26", 2))):
     """Relative L1 of the scattered fluence through a slab, collimated light, against the integral equation in float64."""
     fine = 1600
     z = (np.arange(fine) + 0.5) * tau / fine
@@ -119,7 +119,7 @@ def slab_emission(tau=16.0, albedo=0.9, count=32):
     sun = DirectionalLights(jnp.asarray([[0.0, 0, 1]]), jnp.ones((1, 3)))
     scene = Scene(medium=medium, directional_lights=sun)
     rows = []
-    for name, corrections in (("paper", 0), ("26", 0), ("26", 2)):
+    for name, corrections in forms:
         plan = lattice_boltzmann.plan(
             scene, None, lattice=name, corrections=corrections, resolution=round(width / tau * count), rays_per_voxel=1.0
         )

@@ -1,6 +1,6 @@
 """Time to equal error in a dense, bright medium: the lattice, our path tracer and Mitsuba's volpath.
 
-    python experiments/lattice_equal_time.py [--size 64] [--samples 256] [--resolutions 16 32 64] [--sizes 64 256]
+    python experiments/lattice_equal_time.py [--size 64] [--samples 64] [--resolutions 16 32 64] [--pixel-samples 4 9]
 
 A cube of optical thickness 16 and albedo 0.99 in a slanted parallel beam. The reference is our path tracer with many
 samples at `size`; the lattice's relMSE against it is taken with the reference's own variance removed, so that what is left
@@ -9,6 +9,7 @@ and its time per sample, both measured here; at another picture size it grows wi
 timed there. Times: CPU seconds, warm; Mitsuba by its fastest variant that runs here. `load` says what else ran.
 """
 
+import itertools
 import os
 import tempfile
 from pathlib import Path
@@ -77,7 +78,7 @@ def mitsuba_time(scene, chosen):
 
 
 def main():
-    chosen = arguments(__doc__, size=64, samples=64, batches=8, resolutions=[16, 32, 64], sizes=[64, 256])
+    chosen = arguments(__doc__, size=64, samples=64, batches=8, resolutions=[16, 32, 64], sizes=[64, 256], pixel_samples=[4, 9])
     scene = cube()
     mean, variance, cpu = path_traced(scene, chosen)
     total = chosen.samples * chosen.batches
@@ -90,12 +91,13 @@ def main():
     print(f"path tracer {per_sample:.3f} s a sample, Mitsuba {variant} {peer_per_sample:.3f}; power ratio "
           f"{mean.mean() / peer_mean.mean():.4f}; relMSE x s: ours {ours:.3g}, Mitsuba's {peer:.3g}")  # fmt: skip
     rows, images, titles = [], [mean], [f"path tracer, {total} samples, {cpu:.0f} CPU s"]
-    for resolution in chosen.resolutions:
-        plan = lattice_boltzmann.plan(scene, view(chosen.size), resolution=resolution)
+    for resolution, pixel_samples in itertools.product(chosen.resolutions, chosen.pixel_samples):
+        options = {"resolution": resolution, "samples_per_pixel": pixel_samples}
+        plan = lattice_boltzmann.plan(scene, view(chosen.size), **options)
         picture = volume_image(lattice_boltzmann.render(scene, view(chosen.size), plan).mean)
         relmse = image.relmse(picture, mean, variance=variance)
         images.append(picture)
-        titles.append(f"lattice {resolution}: relMSE {relmse:.2g}")
+        titles.append(f"lattice {resolution}, {pixel_samples} samples: relMSE {relmse:.2g}")
         for size in chosen.sizes:
             camera = view(size)
             lattice_boltzmann.render(scene, camera, plan)
@@ -103,8 +105,8 @@ def main():
                 jax.block_until_ready(lattice_boltzmann.render(scene, camera, plan).mean)
             share = (size / chosen.size) ** 2
             slow, peer_s = share * ours / relmse, share * peer / relmse
-            rows.append({
-                "resolution": resolution, "size": size, "relmse": relmse, "bias": image.bias(picture, mean),
+            rows.append(options | {
+                "size": size, "relmse": relmse, "bias": image.bias(picture, mean),
                 "relative_l1": image.relative_l1(picture, mean, block=2), "reference_relmse": reference_relmse,
                 "cpu_s": spent.cpu, "path_tracer_s": slow, "mitsuba_s": peer_s, "mitsuba_variant": variant,
                 "times_faster": slow / spent.cpu, "times_faster_than_mitsuba": peer_s / spent.cpu, "load": os.getloadavg()[0],
@@ -113,7 +115,7 @@ def main():
     pictures(chosen.out / "equal_time_pictures.png", images, titles, columns=4)
     fig, axis = plt.subplots(figsize=(5, 3.4), constrained_layout=True)
     for size in chosen.sizes:
-        mine = [r for r in rows if r["size"] == size]
+        mine = [r for r in rows if r["size"] == size and r["samples_per_pixel"] == chosen.pixel_samples[-1]]
         errors = [r["relmse"] for r in mine]
         (line,) = axis.loglog([r["cpu_s"] for r in mine], errors, "o-", label=f"lattice, {size}^2")
         for key, style, label in (("path_tracer_s", "--", "path tracer"), ("mitsuba_s", ":", "Mitsuba")):

@@ -12,6 +12,8 @@ It cannot: keep sharp features below a voxel; scatter light back from surfaces i
 meshes inside refractive bodies, as voxels; split orders of anisotropic scattering; cast caustics on surfaces outside.
 """
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,7 @@ from jaxvol import camera as cameras
 from jaxvol import extinction, ray_casting, segments
 from jaxvol.layers import from_items
 from jaxvol.methods.lattice_boltzmann.illumination import Illumination, illuminate
+from jaxvol.methods.lattice_boltzmann.materials import cropped
 from jaxvol.methods.lattice_boltzmann.planning import Plan, claims, plan
 from jaxvol.methods.lattice_boltzmann.refraction import radiance_bent
 from jaxvol.methods.lattice_boltzmann.view import Source, emission_table, gather_straight
@@ -72,6 +75,7 @@ def _sources(plan, light):
 
 def render(scene: Scene, camera: Camera, plan: Plan, *, seed: int = 0, on_stage=None) -> Estimate:
     """The picture's volume layers, deterministic but for jitter; `diagnostics` tells whether the lattice converged."""
+    scene = replace(scene, medium=cropped(scene.medium))
     light = illuminate(scene, plan, seed=seed, on_stage=on_stage)
     side = int(np.ceil(np.sqrt(plan.samples_per_pixel)))
     while plan.samples_per_pixel % side:

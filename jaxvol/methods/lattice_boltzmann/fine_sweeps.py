@@ -9,8 +9,8 @@ diffusion constant at sigma_t h = 0.5 (measured: a point source in a cube 4.1 % 
 are those of Lax and Wendroff in flux form: what is not conserved at the faces shows as reflectance (+4 % at thickness 8).
 
 The correction (illumination.py) removes the lattice's angular error: phi <- phi + (I - B26 k)^-1 (B80 (k phi + b) - phi),
-two of them, each a lattice solve. What is left is first order at lit faces: -2 % of a slab's reflectance at 1/8 mean free
-path.
+two of them, each a lattice solve, also for moments of anisotropic light (`moments`). What is left
+is first order at lit faces: -2 % of a slab's reflectance at 1/8 mean free path.
 """
 
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxvol.methods.lattice_boltzmann.anisotropy import basis
 from jaxvol.methods.lattice_boltzmann.lattice import ProbabilityMap, beta_gamma
 
 # cosines and weights (of one octant, sum 1) of the level-symmetric S8 set
@@ -40,43 +41,59 @@ def directions() -> tuple[tuple[tuple[float, float, float], float], ...]:
 
 
 def transport(
-    extinction: Float[Array, "X Y Z"], source: Float[Array, "X Y Z"], *, kind: ProbabilityMap = "pade"
+    extinction: Float[Array, "..."], source: Float[Array, "X Y Z"], *, kind: ProbabilityMap = "pade"
 ) -> Float[Array, "X Y Z"]:
-    """phi: the fluence times h^2 that an isotropic source [W per voxel] makes without scattering; sigma_t h per voxel."""
-    phi = jnp.zeros_like(source)
+    """phi: the fluence times h^2 that an isotropic source [W per voxel] makes without scattering, from sigma_t h."""
+    return moments(extinction, source[None], degree=0, kind=kind)[0]
+
+
+def moments(
+    extinction: Float[Array, "..."], sources: Float[Array, "n X Y Z"], *, degree: int, kind: ProbabilityMap = "pade"
+) -> Float[Array, "n X Y Z"]:
+    """The same for sources with the moments of `anisotropy.basis`, up to `degree`: moments of the light that they make."""
+    total = jnp.zeros_like(sources)
     for axis in range(3):
         along = (axis, *(a for a in range(3) if a != axis))
-        back = tuple(int(k) for k in np.argsort(along))
-        mine = []
-        for vector, weight in directions():
-            if max(range(3), key=lambda a, v=vector: (abs(v[a]), -a)) == axis:
-                length = 1.0 / vector[axis]
-                mine.append((round(length, 6), weight, vector[along[1]] * length, vector[along[2]] * length))
-        moved = [jnp.transpose(x, along) for x in (extinction, source)]
-        total = _scan(*moved, mine, kind, sense=1) + _scan(*moved, mine, kind, sense=-1)
-        phi = phi + jnp.transpose(total, back)
-    return phi
+        back = (0, *(1 + int(k) for k in np.argsort(along)))
+        mine = [(v, w) for v, w in directions() if max(range(3), key=lambda a, v=v: (abs(v[a]), -a)) == axis]
+        moved = extinction if jnp.ndim(extinction) == 0 else jnp.transpose(extinction, along)
+        emitted = jnp.transpose(sources, (1 + axis, 0, *(1 + a for a in along[1:])))  # planes first
+        found = sum(_scan(moved, emitted, mine, along, degree, kind, sense=sense) for sense in (1, -1))
+        total = total + jnp.transpose(jnp.moveaxis(found, 1, 0), back)
+    return total
 
 
-def _scan(extinction, source, steps, kind, *, sense):
+def _scan(extinction, sources, mine, along, degree, kind, *, sense):
+    steps = []  # (length of a step, weight, shifts of rows and columns, values of the basis)
+    for vector, weight in mine:
+        length = 1.0 / vector[along[0]]
+        values = [float(v) for v in basis(*(sense * np.array(vector)), degree)]
+        steps.append((round(length, 6), weight, vector[along[1]] * length, vector[along[2]] * length, values))
     lengths = sorted({length for length, *_ in steps})
+    varying = jnp.ndim(extinction) > 0
+
+    def links(sigma):
+        """(what of an arrival counts, of the own source, what passes, of the source) by the length of a step."""
+        maps = {length: beta_gamma(length * sigma, kind) for length in lengths}
+        return {k: (beta, k * gamma, 1.0 - k * sigma * beta, k * beta) for k, (beta, gamma) in maps.items()}
+
+    same = None if varying else links(extinction)
 
     def body(faces, planes):
-        sigma, emitted = planes
-        voxel = {}
-        for length in lengths:
-            beta, gamma = beta_gamma(length * sigma, kind)
-            voxel[length] = beta, length * gamma * emitted, 1.0 - length * sigma * beta, length * beta * emitted
-        total, leaving = 0.0, []
-        for face, (length, weight, row_shift, column_shift) in zip(faces, steps, strict=True):
-            beta, own, through, made = voxel[length]
+        sigma, source = planes if varying else (extinction, planes)
+        voxel = links(sigma) if varying else same
+        gathered, leaving = [0.0] * source.shape[0], []
+        for face, (length, weight, row_shift, column_shift, values) in zip(faces, steps, strict=True):
+            beta, own, through, out = voxel[length]
+            emitted = sum(v * source[n] for n, v in enumerate(values))
             face = _shift(_shift(face, 0, sense * row_shift), 1, sense * column_shift)
-            total = total + weight * (beta * face + own)
-            leaving.append(through * face + made)
-        return tuple(leaving), total
+            mean = weight * (beta * face + own * emitted)
+            gathered = [total + v * mean for total, v in zip(gathered, values, strict=True)]
+            leaving.append(through * face + out * emitted)
+        return tuple(leaving), jnp.stack(gathered)
 
-    start = tuple(jnp.zeros(source.shape[1:], source.dtype) for _ in steps)
-    return lax.scan(body, start, (extinction, source), reverse=sense < 0)[1]
+    start = tuple(jnp.zeros(sources.shape[2:], sources.dtype) for _ in steps)
+    return lax.scan(body, start, (extinction, sources) if varying else sources, reverse=sense < 0)[1]
 
 
 def _shift(plane, axis, amount):

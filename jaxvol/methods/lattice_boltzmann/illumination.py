@@ -17,6 +17,8 @@ from jaxvol.methods.lattice_boltzmann.solver import solve
 from jaxvol.methods.lattice_boltzmann.sweeps import transport
 from jaxvol.types import Scene
 
+_EARLY = 1e-2  # relative residual of the lattice before its last correction
+
 
 class Unscattered(NamedTuple):
     """Marched light that was scattered not even forwards, for the exact first order (view.py)."""
@@ -79,10 +81,10 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
         scattered, flux, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
         from_volume = jnp.zeros_like(scattered)  # orders are not split
     elif plan.solve:
-        results = [
-            _channel(materials.scattering[c], materials.absorption[c], deposit[c], first[c], wall, reflectances[c], plan)
-            for c in range(plan.num_channels)
-        ]
+        sigmas = [(materials.scattering[c], materials.absorption[c]) for c in range(plan.num_channels)]
+        if plan.homogeneous:
+            sigmas = [(s[0, 0, 0], a[0, 0, 0]) for s, a in sigmas]
+        results = [_channel(*sigmas[c], deposit[c], first[c], wall, reflectances[c], plan) for c in range(plan.num_channels)]
         from_volume, scattered, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
         if materials.solid is not None:  # what walls gather is no fluence; near them the medium's is held
             from_volume, scattered = (jax.vmap(_fill, (0, None))(x, materials.solid) for x in (from_volume, scattered))
@@ -131,20 +133,50 @@ def _fill(field, solid):
 
 def _directional(materials, channel, whole, flow, plan):
     """(fluence, flux times 3 lambda_1, applications, residual, converged) with a Theta that depends on direction."""
-    found = solve_directional(
-        materials.scattering[channel], materials.absorption[channel], materials.asymmetry, whole, flow, channel, plan=plan
-    )
-    scale = anisotropy.eigenvalues(materials.asymmetry, plan.degree)[1]
+    scattering, absorption, g = materials.scattering[channel], materials.absorption[channel], materials.asymmetry
+    sources = first_sources(scattering, whole, flow, g, channel, plan=plan)
+    if not plan.corrections:
+        found = solve_directional(scattering, absorption, g, sources, plan.tolerance, plan=plan)
+    else:
+        strength = _strength(scattering, g, plan.degree)
+        moments, applications = jnp.zeros_like(sources), jnp.zeros((), jnp.int32)
+        for turn in range(1 + plan.corrections):
+            emitted = strength * moments + sources
+            arriving = fine_moments(scattering + absorption, emitted, degree=plan.degree, kind=plan.probability_map)
+            defect = arriving - moments
+            share, tolerance = _wanted(defect, arriving, turn, plan)
+            found = solve_directional(scattering, absorption, g, strength * defect, tolerance, plan=plan)
+            moments, applications = moments + defect + found.moments, applications + found.num_applications
+        found = found._replace(moments=moments, num_applications=applications, residual=share * found.residual)
+    scale = anisotropy.eigenvalues(g, plan.degree)[1]
     flux = 3.0**0.5 * scale * found.moments[1:4]  # the moments carry sqrt(3)
-    return found.moments[0], flux, found.num_applications, found.residual, found.converged
+    return jnp.maximum(found.moments[0], 0.0), flux, found.num_applications, found.residual, found.converged
 
 
-def _solve_directional(scattering, absorption, g, whole, flow, channel, *, plan):
+def _strength(scattering, g, degree):
+    """k lambda_l of each moment."""
+    scale = anisotropy.eigenvalues(g, degree)
+    return jnp.stack([scattering * scale[l] for l in anisotropy.orders(degree)])
+
+
+def _wanted(defect, arriving, turn, plan):
+    """(share of the defect in the light, relative residual that its solve should reach)."""
+    # an error of the correction weighs as much less as the defect is smaller than the light itself
+    share = jnp.sqrt(jnp.sum(defect * defect) / jnp.maximum(jnp.sum(arriving * arriving), 1e-30))
+    tolerance = jnp.minimum(plan.tolerance / jnp.maximum(share, 1e-6), 0.1)
+    # before the last one: what is left is part of the next defect
+    return share, jnp.maximum(tolerance, _EARLY) if turn < plan.corrections else tolerance
+
+
+def _first_sources(scattering, whole, flow, g, channel, *, plan):
     mean = jnp.maximum(jnp.mean(whole, axis=0), 1e-20)
-    sources = anisotropy.first_collisions(scattering, whole[channel], flow * (whole[channel] / mean), g, plan.degree)
+    return anisotropy.first_collisions(scattering, whole[channel], flow * (whole[channel] / mean), g, plan.degree)
+
+
+def _solve_directional(scattering, absorption, g, sources, tolerance, *, plan):
     return anisotropy.solve(
         lattice(plan.lattice), scattering, absorption, g, sources, degree=plan.degree, kind=plan.probability_map,
-        tolerance=plan.tolerance, max_steps=plan.max_applications,
+        tolerance=tolerance, max_steps=plan.max_applications,
     )  # fmt: skip
 
 
@@ -219,18 +251,15 @@ def _channel(scattering, absorption, deposit, first, wall, reflectance, plan):
     phi = jnp.zeros_like(deposit)
     applications, residual, converged = jnp.zeros((), jnp.int32), jnp.zeros(()), jnp.asarray(True)
     once = None
-    for _ in range(1 + plan.corrections):
+    for turn in range(1 + plan.corrections):
         arriving = fine_transport(extinction, scattering * phi + deposit, kind=plan.probability_map)
         once = arriving if once is None else once
         defect = arriving - phi
-        # an error of the correction weighs as much less as the defect is smaller than the light itself
-        share = jnp.sqrt(jnp.sum(defect * defect) / jnp.maximum(jnp.sum(arriving * arriving), 1e-30))
-        tolerance = jnp.minimum(plan.tolerance / jnp.maximum(share, 1e-6), 0.1)
+        share, tolerance = _wanted(defect, arriving, turn, plan)
         answer = solve_channel(scattering, absorption, scattering * defect, None, 0.0, tolerance, plan=plan)
         phi = phi + defect + answer.phi
         applications = applications + answer.num_applications
-        residual = jnp.maximum(residual, share * answer.residual)
-        converged = converged & answer.converged
+        residual, converged = share * answer.residual, answer.converged
     from_volume = fine_transport(extinction, first, kind=plan.probability_map) if plan.num_surface_rays else once
     return from_volume, phi, applications, residual, converged
 
@@ -248,7 +277,9 @@ def _lattice_transport(scattering, absorption, source, wall, *, plan):
     return transport(directions, co, source)
 
 
+first_sources = jax.jit(_first_sources, static_argnames="plan")
 solve_directional = jax.jit(_solve_directional, static_argnames="plan")
 solve_channel = jax.jit(_solve_channel, static_argnames="plan")
 lattice_transport = jax.jit(_lattice_transport, static_argnames="plan")
 fine_transport = jax.jit(fine_sweeps.transport, static_argnames="kind")
+fine_moments = jax.jit(fine_sweeps.moments, static_argnames=("degree", "kind"))

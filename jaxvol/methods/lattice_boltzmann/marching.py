@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials
 
 Integrator = Literal["leapfrog", "smooth", "euler"]
-_ROUND = 32  # steps between re-packings
+_ROUND = 16  # steps between re-packings
 _BATCH = 1 << 16  # rays at a time
 _WEAKEST = 1e-4  # rays that carry less than this share of the start are ended, their rest counted as live
 
@@ -194,15 +194,14 @@ class _Books:
         )
 
 
-def _run(advance, rays, track, books, max_rounds=400):
+def _run(advance, rays, track, books):
     """Rounds of steps until no ray is left, packing the living ones between rounds."""
-    found = track
-    for _, found in _rounds(advance, rays, track, books, max_rounds):  # noqa: B007
+    for _, found in _rounds(advance, rays, track, books):  # noqa: B007
         pass
     return found
 
 
-def _rounds(advance, rays, track, books, max_rounds=400):
+def _rounds(advance, rays, track, books, max_rounds=800):
     """(rays still on their way, track so far) after each round."""
     for _ in range(max_rounds):
         count = _bucket(len(rays.power[0]))
@@ -227,7 +226,7 @@ def _bucket(count):
     """Few array sizes, so that rounds share compilations."""
     size = 1024
     while size < count:
-        size *= 2 if size < 1 << 14 else 4
+        size *= 2
     return size
 
 
@@ -243,12 +242,15 @@ def corner_table(*fields: Float[Array, "X Y Z"]) -> Float[Array, "voxels F"]:
 
 
 def interpolate(
-    table: Float[Array, "voxels F"], shape: tuple[int, int, int], position: Float[Array, "n 3"]
+    table: Float[Array, "voxels F"], shape: tuple[int, int, int], position: Float[Array, "n 3"], *, beyond: float = 0.0
 ) -> Float[Array, "n F"]:
-    """Trilinear lookup between voxel centres, held constant beyond the outer centres; position in voxel units."""
+    """Trilinear lookup between voxel centres; position in voxel units.
+
+    Outside the outer centres the field goes on linearly for `beyond` voxels, then it is held constant.
+    """
     last = jnp.asarray(shape, jnp.float32) - 1.0
-    at = jnp.clip(position - 0.5, 0.0, last)
-    low = jnp.minimum(at.astype(jnp.int32), jnp.maximum(jnp.asarray(shape, jnp.int32) - 2, 0))
+    at = jnp.clip(position - 0.5, -beyond, last + beyond)
+    low = jnp.clip(at.astype(jnp.int32), 0, jnp.maximum(jnp.asarray(shape, jnp.int32) - 2, 0))
     high = jnp.minimum(low + 1, jnp.asarray(shape, jnp.int32) - 1)
     fx, fy, fz = ((at - low)[:, a, None] for a in range(3))
 

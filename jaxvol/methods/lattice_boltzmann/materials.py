@@ -12,9 +12,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy import sparse
 from scipy.ndimage import gaussian_filter
 
-from jaxvol import extinction, media
+from jaxvol import media
 from jaxvol.types import Medium, Mesh
 from jaxvol.voxelization import surface_voxels, voxelize
 
@@ -82,6 +83,34 @@ def body_bounds(medium: Medium) -> np.ndarray:
     return np.array([np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)])
 
 
+def cropped(medium: Medium) -> Medium:
+    """The same medium without the empty border of its density grid, in a smaller box; eager.
+
+    One layer of empty voxels stays, over which the trilinear density falls to zero. A medium with inclusions or an index
+    keeps its box, since that says where these are.
+    """
+    if medium.density is None or medium.inclusions or medium.ior is not None:
+        return medium
+    density = np.asarray(medium.density)
+    filled = density > 0
+    spans = []
+    for axis, count in enumerate(density.shape):
+        where = np.flatnonzero(filled.any(axis=tuple(a for a in range(3) if a != axis)))
+        if len(where) == 0:
+            return medium
+        spans.append((max(int(where[0]) - 1, 0), min(int(where[-1]) + 2, count)))
+    low, high = (np.array(x) for x in zip(*spans, strict=True))
+    if np.prod(high - low) > 0.9 * density.size:
+        return medium
+    lower, upper = np.asarray(medium.bounds, np.float64)
+    edge = (upper - lower) / density.shape
+    inner = density[tuple(slice(*span) for span in spans)]
+    bounds = np.stack([lower + low * edge, lower + high * edge])
+    block = 4 if medium.majorants is None else medium.majorants.block
+    fields = jnp.asarray(bounds, jnp.float32), jnp.asarray(inner), media.majorants(inner, block=block)
+    return eqx.tree_at(lambda m: (m.bounds, m.density, m.majorants), medium, fields, is_leaf=lambda x: x is None)
+
+
 def make_grid(medium: Medium, *, resolution: int, margin: int = 0) -> Grid:
     """Cubic voxels over the body, `resolution` along its longest side, plus `margin` voxels all around; eager."""
     low, high = body_bounds(medium)
@@ -105,10 +134,9 @@ def build(
     refractive = any(part.ior is not None for part in regions(medium))
     index, filled = np.ones(grid.shape, np.float32), np.zeros(grid.shape, np.float32)
     asymmetry = None if media.is_isotropic(medium) else np.zeros(grid.shape, np.float32)
-    marching = extinction.marching_medium(medium)
     for number, part in enumerate(regions(medium)):
         share = _share(part, bounds, grid.shape, supersampling)
-        density = _density(marching, number, bounds, grid.shape)
+        density = _density(part, bounds, grid.shape)
         for channel in range(num_channels):
             for field, sigma in ((scattering, all_s), (absorption, all_a)):
                 field[channel] += share * (sigma[number, channel] * voxel * density - field[channel])
@@ -166,25 +194,35 @@ def _share(part, bounds, shape, supersampling):
     return (voxelize(part.boundary, bounds, shape, supersampling=supersampling) * covered).astype(np.float32)
 
 
-def _density(marching, number, bounds, shape):
-    part = marching.regions[number]
+def _density(part, bounds, shape):
+    """Mean density of each voxel, by the trilinear field at `_SUBSAMPLES`^3 points: one small matrix per axis."""
     if part.density is None:
         return np.float32(1.0)
-    same = part.density.shape == shape and np.allclose(part.bounds, bounds, atol=1e-4 * float(np.max(bounds[1] - bounds[0])))
+    field = np.asarray(part.density)
+    same = field.shape == shape and np.allclose(part.bounds, bounds, atol=1e-4 * float(np.max(bounds[1] - bounds[0])))
     if same:
-        return np.asarray(part.density)
-    axes = []
+        return field
     for axis in range(3):
-        fine = shape[axis] * _SUBSAMPLES
-        axes.append(bounds[0, axis] + (np.arange(fine) + 0.5) * (bounds[1, axis] - bounds[0, axis]) / fine)
-    total = np.zeros(shape, np.float32)
-    y, z = np.meshgrid(axes[1], axes[2], indexing="ij")
-    for i, x in enumerate(axes[0]):
-        points = np.stack([np.full(y.shape, x), y, z], -1).astype(np.float32)
-        plane = np.asarray(extinction.region_density(marching, number, jnp.asarray(points)))
-        blocks = plane.reshape(shape[1], _SUBSAMPLES, shape[2], _SUBSAMPLES).mean((1, 3))
-        total[i // _SUBSAMPLES] += blocks / _SUBSAMPLES
-    return total
+        own = np.asarray(part.bounds, np.float64)[:, axis]
+        matrix = _resampling(own, field.shape[axis], bounds[:, axis], shape[axis])
+        moved = np.moveaxis(field, axis, 0)
+        found = (matrix @ moved.reshape(len(moved), -1)).reshape(-1, *moved.shape[1:])
+        field = np.moveaxis(found, 0, axis)
+    return field
+
+
+def _resampling(own, num_own, wanted, num_wanted):
+    """[num_wanted, num_own] sparse: mean over the samples in a voxel of linear interpolation, 0 outside `own`."""
+    fine = num_wanted * _SUBSAMPLES
+    points = wanted[0] + (np.arange(fine) + 0.5) * (wanted[1] - wanted[0]) / fine
+    inside = (points >= own[0]) & (points <= own[1])
+    at = np.clip((points - own[0]) / (own[1] - own[0]) * num_own - 0.5, 0.0, num_own - 1.0)
+    low = np.minimum(at.astype(int), max(num_own - 2, 0))
+    high, row = np.minimum(low + 1, num_own - 1), np.arange(fine) // _SUBSAMPLES
+    share = np.where(inside, 1.0 / _SUBSAMPLES, 0.0)
+    values = np.concatenate([share * (1.0 - (at - low)), share * (at - low)]).astype(np.float32)
+    index = np.tile(row, 2), np.concatenate([low, high])
+    return sparse.csr_matrix((values, index), shape=(num_wanted, num_own))
 
 
 def _index(part, bounds, shape):

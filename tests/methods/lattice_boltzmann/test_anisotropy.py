@@ -9,11 +9,11 @@ import pytest
 from jaxvol import camera as cameras
 from jaxvol import direct
 from jaxvol.methods import lattice_boltzmann
-from jaxvol.methods.lattice_boltzmann import anisotropy, preconditioner
+from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES, coefficients
 from jaxvol.methods.lattice_boltzmann.solver import solve
-from jaxvol.types import Camera, DirectionalLights, Medium, Scene
+from jaxvol.types import Camera, DirectionalLights, Medium, Rays, Scene
 
 LATTICE = LATTICES["26"]
 
@@ -96,6 +96,42 @@ def test_thin_media_scatter_by_the_exact_phase_function(anisotropy):
         exact = np.asarray(direct.render(scene, camera, direct.plan(scene, camera, samples_per_pixel=4)).mean.volume_from_light)
         # what is left is light that was scattered twice
         assert 0.97 * exact.sum() < ours.sum() < 1.06 * exact.sum()
+
+
+@pytest.mark.slow
+def test_reflectance_of_a_slab_that_scatters_forwards():
+    """T4: g = 0.75, thickness 2, albedo 1, light along the normal: R = 0.163176; similarity gives 0.203."""
+    tau, width, count = 2.0, 20.0, 8
+    medium = Medium(jnp.asarray([[0, 0, 0], [width, width, tau]], jnp.float32), jnp.ones(3), jnp.zeros(3), jnp.float32(0.75))
+    scene = Scene(medium=medium, directional_lights=DirectionalLights(jnp.asarray([[0.0, 0, 1]]), jnp.ones((1, 3))))
+    plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), rays_per_voxel=1.0, view_step=0.25)
+    light = lattice_boltzmann.illuminate(scene, plan)
+    assert bool(light.diagnostics["converged"])
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    mu, phi = (a.ravel() for a in np.meshgrid(0.5 * (nodes + 1), (np.arange(8) + 0.5) / 4 * np.pi, indexing="ij"))
+    r = np.sqrt(1 - mu * mu)
+    up = np.stack([r * np.cos(phi), r * np.sin(phi), mu], 1)
+    origin = np.array([width / 2, width / 2, 0.0]) - 1e-3 * up
+    rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (origin, up, np.full(len(mu), np.inf))))
+    (radiance,) = (v[:, 0] for v in lattice_boltzmann.radiance(scene, rays, plan, light).values())
+    reflectance = float(np.sum(radiance * np.repeat(0.5 * weights, 8) * mu) * 2 * np.pi / 8)
+    assert reflectance == pytest.approx(0.163176, rel=0.06)
+
+
+def test_corrections_along_many_directions_agree_where_nothing_is_left_to_correct():
+    """Moments by 80 directions against 26 for a source that fills a cube: equal to 3 %; isotropic ones as without moments."""
+    shape = (9, 9, 9)
+    rng = np.random.default_rng(0)
+    sigma = jnp.asarray(0.3 + 0.2 * rng.random(shape), jnp.float32)
+    source = jnp.asarray(rng.random(shape), jnp.float32)
+    sources = jnp.zeros((4, *shape)).at[0].set(source).at[3].set(0.4 * source)
+    fine = jax.jit(lambda s: fine_sweeps.moments(sigma, s, degree=1))(sources)
+    coarse = jax.jit(lambda s: anisotropy.transport(LATTICE, sigma, s, degree=1))(sources)
+    size = float(jnp.mean(fine[0]))
+    np.testing.assert_allclose(jnp.mean(fine, axis=(1, 2, 3)) / size, jnp.mean(coarse, axis=(1, 2, 3)) / size, atol=0.03)
+    alone = fine_sweeps.transport(sigma, source)
+    with_moments = fine_sweeps.moments(sigma, sources.at[3].set(0.0), degree=1)
+    np.testing.assert_allclose(with_moments[0], alone, rtol=1e-4)
 
 
 def test_plan_refuses_what_directions_cannot_do():

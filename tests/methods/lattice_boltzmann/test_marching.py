@@ -113,6 +113,33 @@ def test_total_reflection():
     assert not forward and angle == pytest.approx(60.0, abs=0.02)
 
 
+def test_grazing_rays_keep_their_energy():
+    """Where the projection's radicand is negative it is left out: nothing becomes NaN, |p| = n again behind the step."""
+
+    def index(x):
+        return 1.5 - 0.5 * 0.5 * (1 + jax.lax.erf(x[2] / np.sqrt(2)))
+
+    angles = np.radians([41.9, 60.0, 80.0, 88.0])  # 41.81 is the critical angle
+    toward = jnp.asarray(np.stack([np.sin(angles), 0 * angles, np.cos(angles)], 1), jnp.float32)
+    start = jnp.asarray(np.stack([0 * angles, 0 * angles, 0 * angles - 4.5], 1), jnp.float32)
+    xs, ps = _trace(index, start, toward, 0.5, 800)
+    left = ps[np.argmax((xs[1:, :, 2] < -4.3) & (ps[..., 2] < 0), axis=0), np.arange(4)]
+    np.testing.assert_allclose(np.linalg.norm(left, axis=1), 1.5, rtol=1e-3)
+    np.testing.assert_allclose(left[:, 0], 1.5 * np.sin(angles), rtol=1e-4)
+
+
+def test_a_jump_of_the_index_drifts_without_the_filter():
+    """|p| / n behind a step of n from 1 to 1.5: kept over a width of one step, lost over a twentieth of it."""
+    drift = {}
+    for width in (1.0, 0.05):
+        index = lambda x, w=width: 1.25 + 0.25 * jax.lax.erf(x[2] / (np.sqrt(2) * w))  # noqa: E731
+        toward = jnp.tile(jnp.asarray([[0.5, 0, np.sqrt(0.75)]], jnp.float32), (6, 1))
+        start = jnp.asarray(np.stack([np.zeros(6), np.zeros(6), -6 - np.arange(6) / 6], 1), jnp.float32)
+        _, ps = _trace(index, start, toward, 1.0, 24, "smooth")
+        drift[width] = np.max(np.abs(np.linalg.norm(ps[-1], axis=1) / 1.5 - 1))
+    assert drift[1.0] < 0.01 and drift[0.05] > 0.1
+
+
 def _materials(shape, scattering, absorption, ior=None):
     gradient = None if ior is None else jnp.asarray(np.stack(np.gradient(0.5 * np.asarray(ior) ** 2)))
     grid = Grid(jnp.asarray([-1.0, 0.0, 2.0]), jnp.float32(0.5), shape)
@@ -162,6 +189,7 @@ def test_bent_rays_conserve_and_reach_the_same_books_without_bending():
     origin, direction, t_max, power = _slanted_rays(4000, flat)
     straight = marching.march_straight(flat, origin, direction, t_max, power)
     bent = marching.march_bent(flat, origin, direction, t_max, power, step=0.1)
+    assert bent.live[0] < 1e-4 * power.sum()
     removed = float(jnp.sum((flat.scattering + flat.absorption) * bent.track))
     assert removed + bent.escaped[0] + bent.live[0] == pytest.approx(power.sum(), rel=1e-5)
     coarse = lambda t: np.asarray(t[0]).reshape(4, 2, 4, 2, 4, 2).sum((1, 3, 5))  # noqa: E731

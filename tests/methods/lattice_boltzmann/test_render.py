@@ -10,10 +10,12 @@ import pytest
 import trimesh
 
 from jaxvol import camera as cameras
+from jaxvol import lights as light_types
+from jaxvol import media
 from jaxvol.layers import items
-from jaxvol.methods import lattice_boltzmann
-from jaxvol.methods.lattice_boltzmann import fine_sweeps, illumination, light_rays
-from jaxvol.types import Camera, DirectionalLights, Medium, Mesh, PointLights, Rays, Scene
+from jaxvol.methods import lattice_boltzmann, path_tracing
+from jaxvol.methods.lattice_boltzmann import fine_sweeps, illumination, light_rays, materials
+from jaxvol.types import Camera, DirectionalLights, Medium, Mesh, PointLights, Rays, Scene, SpotLights
 
 
 def _scene(sigma_s=(2.0, 2.0, 2.0), sigma_a=(0.2, 0.2, 0.2), light=(1.0, 1.0, 1.0), **fields):
@@ -37,7 +39,7 @@ SMALL = {"resolution": 8, "rays_per_voxel": 2.0, "samples_per_pixel": 1}
 
 
 def _picture(scene, **options):
-    plan = lattice_boltzmann.plan(scene, _camera(), **SMALL, **options)
+    plan = lattice_boltzmann.plan(scene, _camera(), **(SMALL | options))
     return lattice_boltzmann.render(scene, _camera(), plan, seed=0), plan
 
 
@@ -76,6 +78,82 @@ def test_constant_grid_is_homogeneous(grey):
     gridded, _ = _picture(_scene(density=jnp.ones((8, 8, 8))))
     for (name, a), (_, b) in zip(items(grey[0].mean), items(gridded.mean), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-3 * float(np.max(np.asarray(a)) + 1e-9), err_msg=name)
+
+
+def test_empty_border_of_a_grid_costs_nothing():
+    """The same cloud in a box of 27 times the volume: the same grid of voxels, the same picture."""
+    rng = np.random.default_rng(0)
+    tight = np.pad(rng.random((6, 6, 6)), 1)
+    plans, pictures, shapes = [], [], []
+    for margin in (0, 8):
+        density = jnp.asarray(np.pad(tight, margin), jnp.float32)
+        edge = 1 / 8
+        bounds = jnp.asarray([[-margin * edge] * 3, [1 + margin * edge] * 3], jnp.float32)
+        scene = eqx.tree_at(lambda s: s.medium.bounds, _scene(density=density), bounds)
+        found, plan = _picture(scene)
+        plans.append(plan)
+        pictures.append(found.mean)
+        inside = materials.cropped(scene.medium)
+        shapes.append((inside.density.shape, materials.make_grid(inside, resolution=8).shape))
+    assert plans[0] == plans[1] and shapes == [((8, 8, 8), (8, 8, 8))] * 2
+    for (name, a), (_, b) in zip(*(items(p) for p in pictures), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(np.max(np.asarray(a)) + 1e-9), err_msg=name)
+
+
+def test_resampled_density_is_the_trilinear_mean():
+    """A grid that does not fit the voxels, against the density looked up at the same points."""
+    medium = _scene(density=jnp.asarray(np.random.default_rng(0).random((5, 6, 7)), jnp.float32)).medium
+    bounds = np.array([[-0.09, 0.0, 0.05], [1.11, 1.2, 1.25]])  # no sample on a face
+    found = materials._density(medium, bounds, (9, 9, 9))
+    axes = [bounds[0, a] + (np.arange(18) + 0.5) * 1.2 / 18 for a in range(3)]
+    points = jnp.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), -1), jnp.float32)
+    expected = np.asarray(media.density(medium, points)).reshape(9, 2, 9, 2, 9, 2).mean((1, 3, 5))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_homogeneous_boxes_solve_with_numbers(grey):
+    assert grey[1].homogeneous and any("homogeneous box" in reason for reason in grey[1].skipped)
+    fields, plan = _picture(_scene(), specialize="structure")
+    assert not plan.homogeneous and plan.num_channels == 3
+    for (name, a), (_, b) in zip(items(grey[0].mean), items(fields.mean), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * float(np.max(np.asarray(a)) + 1e-9), err_msg=name)
+
+
+def test_first_order_in_a_cube_is_exact_up_to_its_lit_faces():
+    """Single scattering at sigma_t h = 0.55, the light of the outer half voxels included, against quadrature."""
+    scattering, extinction, n = 4.0, 4.4, 8
+    scene = _scene(sigma_s=(scattering,) * 3, sigma_a=(extinction - scattering,) * 3)
+    plan = lattice_boltzmann.plan(scene, None, resolution=n, rays_per_voxel=16.0, view_step=0.25)
+    light = lattice_boltzmann.illuminate(scene, plan)
+    x, z = (a.ravel() for a in np.meshgrid((np.arange(16) + 0.5) / 16, (np.arange(16) + 0.5) / 16, indexing="ij"))
+    origin, down = np.stack([x, np.full(256, 2.0), z], 1), np.tile([0.0, -1.0, 0.0], (256, 1))
+    rays = Rays(*(jnp.asarray(v, jnp.float32) for v in (origin, down, np.full(256, np.inf))))
+    ours = lattice_boltzmann.radiance(scene, rays, plan, light)["volume_from_light"][:, 0].mean()
+    depth = (np.arange(4000) + 0.5) / 4000
+    lit = np.minimum(x[:, None] / 0.6, depth[None] / 0.8)  # way of the sun's light (0.6, -0.8, 0) inside the cube
+    exact = np.mean(scattering / (4 * np.pi) * np.exp(-extinction * (lit + depth[None])))
+    assert ours == pytest.approx(exact, rel=0.03)  # held constant in the outer half voxels it is 8 % dark
+
+
+def test_an_index_of_one_is_no_index():
+    plan = lattice_boltzmann.plan(_scene(ior=jnp.float32(1.00005)), None, **SMALL)
+    assert not plan.refract and plan.margin == 0 and any("straight rays" in reason for reason in plan.skipped)
+    assert lattice_boltzmann.plan(_scene(ior=jnp.float32(1.01)), None, **SMALL).refract
+
+
+@pytest.mark.slow
+def test_bent_rays_scatter_anisotropically_as_straight_ones_do():
+    """An index of 1.001 bends nothing to speak of: the bent march, solve and view against the straight ones, g = 0.6."""
+    options = {"anisotropy": "first_order", "corrections": 0, "resolution": 24}
+    straight, plan = _picture(_scene(g=jnp.float32(0.6)), **options)
+    bent, bent_plan = _picture(_scene(g=jnp.float32(0.6), ior=jnp.float32(1.001)), **options)
+    assert not plan.refract and bent_plan.refract and bent_plan.first_order
+    name = "volume_from_light+volume_from_volume+volume_from_multiple"
+    a, b = (np.asarray(x.mean.sums[name]) for x in (straight, bent))
+    assert b.sum() == pytest.approx(a.sum(), rel=0.05)
+    even, _ = _picture(_scene(sigma_s=(0.8,) * 3, ior=jnp.float32(1.001)), corrections=0, resolution=24)  # by similarity alone
+    similar = sum(np.asarray(v) for _, v in items(even.mean))
+    assert abs(similar.sum() / a.sum() - 1) > 0.15
 
 
 def test_power_scales_the_picture(grey):
@@ -136,6 +214,46 @@ def test_light_rays_carry_the_lights_power():
     bulb = Scene(medium=sun.medium, point_lights=PointLights(jnp.asarray([[0.5, 0.5, 0.5]]), jnp.ones((1, 3))))
     inside = light_rays.from_lights(bulb, low, high, 0.1, rays_per_voxel=4.0, seed=0)
     assert inside.power[:, 0].sum() == pytest.approx(4 * np.pi, rel=1e-5)
+
+
+def _lamp():
+    """A square of side 1 at height 3 that shines down with radiance 2."""
+    vertices = jnp.asarray([[0.0, 3, 0], [1, 3, 0], [1, 3, 1], [0, 3, 1]])
+    faces = jnp.asarray([[0, 1, 2], [0, 2, 3]])
+    return Mesh(vertices, faces, jnp.zeros((2, 3)), emission=jnp.full((2, 3), 2.0))
+
+
+def _lamp_fluence():
+    x, z = np.meshgrid(*[(np.arange(50) + 0.5) / 50 - 0.5] * 2)
+    square = x * x + z * z + 2.5**2
+    return np.mean(2.0 * 2.5 / (square * np.sqrt(square)))
+
+
+def _one(value):
+    return jnp.asarray([value], jnp.float32)
+
+
+@pytest.mark.parametrize(
+    ("lights", "fluence"),
+    [
+        ({"point_lights": PointLights(_one([0.5, 3.0, 0.5]), _one([4.0] * 3))}, 4.0 / 2.5**2),
+        (
+            {"spot_lights": SpotLights(_one([0.5, 3.0, 0.5]), _one([0.0, -1, 0]), _one([4.0] * 3), _one(0.5), _one(0.3))},
+            4.0 / 2.5**2,
+        ),
+        ({"directional_lights": DirectionalLights(_one([0.6, -0.8, 0.0]), _one([4.0] * 3))}, 4.0),
+        ({"mesh": _lamp(), "area_lights": light_types.area_lights(_lamp())}, _lamp_fluence()),
+        ({"environment": light_types.environment_light(np.full((8, 16, 3), 0.5))}, 4 * np.pi * 0.5),
+    ],
+    ids=["point", "spot", "directional", "area", "environment"],
+)
+def test_every_light_kind_brings_its_fluence(lights, fluence):
+    """In the middle voxel of a box that takes nothing away."""
+    medium = _scene(sigma_s=(0.0,) * 3, sigma_a=(1e-5,) * 3).medium
+    scene = Scene(medium=medium, **lights)
+    plan = lattice_boltzmann.plan(scene, None, resolution=5, rays_per_voxel=256.0, surface_rays=0)
+    light = lattice_boltzmann.illuminate(scene, plan)
+    assert float(light.from_light[0, 2, 2, 2]) * light.spectrum[0] / 0.2**2 == pytest.approx(fluence, rel=0.03)
 
 
 def test_shadows_cut_light_rays():
@@ -215,6 +333,42 @@ def test_opaque_mesh_inside_a_refractive_body():
 
 
 @pytest.mark.slow
+def test_walls_in_a_medium_with_straight_rays_against_the_path_tracer():
+    """A white cube in fog: with `walls` light comes back from it into the fog, without it passes through."""
+    cube = trimesh.creation.box(extents=[0.5] * 3)
+    cube.apply_translation([0.5] * 3)
+    mesh = Mesh(jnp.asarray(cube.vertices, jnp.float32), jnp.asarray(cube.faces), jnp.full((len(cube.faces), 3), 0.9))
+    scene = eqx.tree_at(lambda s: s.mesh, _scene(sigma_s=(6.0,) * 3), mesh, is_leaf=lambda x: x is None)
+    camera = _camera(16)
+    layers = ("volume_from_volume", "volume_from_multiple")
+    reference = path_tracing.render(scene, camera, path_tracing.plan(scene, camera), seed=0, samples=128)
+    values = [np.asarray(getattr(reference.mean, name)).sum() for name in layers]
+    noise = np.sqrt(sum(np.asarray(getattr(reference.variance, name)).sum() for name in layers)) / sum(values)
+    assert noise < 0.015
+    errors = {}
+    for walls in (False, True):
+        options = {"resolution": 32, "samples_per_pixel": 4, "walls": walls}
+        found = lattice_boltzmann.render(scene, camera, lattice_boltzmann.plan(scene, camera, **options)).mean
+        errors[walls] = sum(np.asarray(getattr(found, name)).sum() for name in layers) / sum(values) - 1
+    assert abs(errors[True]) < 0.06, errors
+
+
+@pytest.mark.slow
+def test_refraction_with_anisotropic_scattering_against_photons():
+    """A sphere of index 1.3, g = 0.6, under a beam: what is absorbed where, against photons that meet Snell and Fresnel."""
+    script = Path(__file__).resolve().parents[3] / "experiments" / "lattice_photons.py"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(script.parent))
+        module = importlib.import_module("lattice_photons")
+    sigma_s, sigma_a, ior, g = 15.2, 0.8, 1.3, 0.6
+    books, exact = module.photon_tracer(sigma_s, sigma_a, ior, 200_000, g=g)
+    assert sum(books.values()) == pytest.approx(1.0, abs=1e-9)
+    absorbed, shells = module.lattice_books(sigma_s, sigma_a, ior, 32, g=g)
+    assert absorbed == pytest.approx(books["absorbed"], rel=0.04)
+    assert np.abs(shells - exact).sum() / exact.sum() < 0.1
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "limit"), [("beam", 0.08), ("point", 0.03)])
 def test_fluence_in_a_cube_against_monte_carlo(case, limit):
     """The default lattice at tau 16, albedo 0.9, 32^3; the walks' own noise is below a third of the limit."""
@@ -227,6 +381,17 @@ def test_fluence_in_a_cube_against_monte_carlo(case, limit):
     assert np.sqrt(exact * photons).sum() / (exact * photons).sum() < limit / 3
     found = module.collisions("26", 2, 16.0, 0.9, module.first_collisions(case, 16.0, 32))
     assert np.abs(found - exact).sum() / exact.sum() < limit
+
+
+@pytest.mark.slow
+def test_emission_density_of_a_slab_against_the_integral_equation():
+    """Optical thickness 16, albedo 0.9, 32 voxels: sigma_s Phi within 5 % (relative L1) of float64 quadrature."""
+    script = Path(__file__).resolve().parents[3] / "experiments" / "lattice_accuracy.py"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(script.parent))
+        module = importlib.import_module("lattice_accuracy")
+    (row,) = module.slab_emission(forms=(("26", 2),))
+    assert row["error"] < 0.05
 
 
 @pytest.mark.slow
