@@ -95,6 +95,8 @@ def unwrap(mesh: Mesh, *, resolution: int, padding: int = 2, uv: Float[np.ndarra
     face = owner[rows, columns]
     centre = np.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], axis=1)
     weight = _barycentric(uv[indices[face]].astype(np.float64), centre)
+    weight = np.maximum(weight, _PULL)  # texels on an edge lie inside neighbouring walls
+    weight /= weight.sum(axis=1, keepdims=True)
     corners = vertex[original[indices[face]]].astype(np.float64)
     return Lightmap(
         uv=np.asarray(uv, np.float32),

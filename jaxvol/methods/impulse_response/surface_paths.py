@@ -156,8 +156,10 @@ def arrive(
     height = dot(delta, normal)
     lateral = delta - height[:, None] * normal
     room = 0.25 / probe_sigma - height
+    # Nearer than the rays' offset, directions from the point and from the ray disagree: in an edge the pdf would vanish.
+    apart = distance > 8 * _LIFT * jnp.maximum(faces.scale, 1e-3)
     return Arrival(
-        valid=by_area | hits.valid,
+        valid=(by_area | hits.valid) & apart,
         face=chosen,
         position=point,
         normal=facing,

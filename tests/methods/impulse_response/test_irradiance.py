@@ -169,6 +169,18 @@ def test_lookups_beyond_the_tables_are_counted():
     assert float(near.diagnostics["beyond_share"]) == 0
 
 
+def test_receivers_in_an_edge_of_a_box():
+    """Next vertices within the rays' offset had no density and a weight of 1e30."""
+    table = {"shapes": [{"mesh": "builtin:cornell_box"}]}
+    table["medium"] = {"density": 1.0, "bounds": [[-1, 0, -1], [1, 2, 1]], "scattering": 0.25, "absorption": 0.01}
+    scene = make_scene(table).scene
+    points = np.tile(np.float32([[-1, 0, 0.5], [-1, 0, -1]]), (64, 1))
+    normals = np.tile(np.float32([0, 1, 0]), (128, 1))
+    for options in ({}, {"back_scattering": False}):
+        estimate = impulse_response.irradiance(scene, points, normals, samples=2, occlusion="drop", **options)
+        assert float(jnp.max(layers.total(estimate.mean))) < 100
+
+
 def test_claims_say_what_is_missed():
     assert [claim.partial for claim in impulse_response.claims(open_plane(0.9))] == [None] * 4
     spot = SpotLights(jnp.zeros((1, 3)), jnp.array([[0, 0, -1.0]]), jnp.ones((1, 3)), jnp.ones(1), jnp.ones(1))
@@ -228,7 +240,7 @@ def test_render_reflects_in_phong_lobes():
         "shapes": [{"mesh": "builtin:plane", "reflectance": 0.3, "specular": 0.5, "exponent": 20.0, "transform": {"scale": 50}}]
     }
     table["camera"] = {"origin": [0, 2, 3], "target": [0, 0, 0], "fov_y": 30, "width": 8, "height": 8}
-    table["lights"] = [{"kind": "directional", "direction": [0, -1, -0.8], "irradiance": 2.0}]
+    table["lights"] = [{"kind": "directional", "direction": [0, -1, 1.5], "irradiance": 2.0}]
     file = make_scene(table)
     plan = impulse_response.plan(file.scene, file.camera, max_bounces=0)
     found = impulse_response.render(file.scene, file.camera, plan, samples=8).mean.surface_from_light
