@@ -18,8 +18,7 @@ from jaxvol.scene import load_scene
 SCENE = Path(__file__).resolve().parent / "scenes" / "les_cumulus.toml"
 MODES = {
     "ours, marched": {},
-    "one marched leg": {"legs": 1},
-    "sixteen marched legs": {"legs": 16},
+    "four marched legs": {"legs": 4},
     "never marched": {"contrast": None},
     "attenuated only": {"scattering": "attenuated"},
     "surface-only": {"scattering": "surface"},

@@ -57,7 +57,7 @@ def bake(
     contrast: Annotated[
         float | None, typer.Option(help="Of density, above which a segment is marched; 1 = never.", min=0, max=1)
     ] = None,
-    legs: Annotated[int, typer.Option(help="Scatter points of a marched segment before the tables.", min=1)] = 4,
+    legs: Annotated[int, typer.Option(help="Scatter points of a marched segment before the tables.", min=1)] = 1,
     similarity: Annotated[bool, typer.Option(help="Multiple scattering by similarity to an isotropic medium.")] = False,
     g_range: Annotated[float | None, typer.Option(help="Single scattering interpolated between three values of g.")] = None,
     harmonics: Annotated[bool, typer.Option(help="SH of incident light in the lightmap's channels.")] = True,

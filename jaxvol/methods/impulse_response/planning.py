@@ -77,7 +77,7 @@ def plan(
     back_scattering: bool = True,
     occlusion: Occlusion = "march",
     contrast: float | None = CONTRAST,
-    legs: int = 4,
+    legs: int = 1,
     similarity: bool = False,
     g_range: float | None = None,
     harmonics: bool = False,
@@ -96,7 +96,8 @@ def plan(
             leg by last leg; "drop" is the paper's rule, and its share is reported.
         contrast: of density about a receiver's segment, (max - min) / max, above which it is integrated with marched sigma;
             None = never, the paper's mode.
-        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64.
+        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64. More follow light around
+            occluders further, but from the second on lamps inside the medium make them noisy (1 / r^2).
         similarity: the paper's map of light scattered twice or more to an isotropic medium.
         g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
         harmonics: also bake SH of incident radiance.

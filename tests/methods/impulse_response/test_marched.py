@@ -83,5 +83,5 @@ def test_light_goes_around_a_wall():
     estimate = impulse_response.irradiance(scene, points, normals, samples=16384, max_bounces=0)
     # path_tracing.irradiance there, 20,000 samples: 9.5e-4 +- .6e-4, 5.2e-4 +- .3e-4, 2.9e-4 +- .4e-4 at 1, 2, 3.
     total = np.asarray(layers.total(estimate.mean))[2:, 0]
-    assert 0.5 < total.sum() / 1.76e-3 < 1.2
+    assert 0.4 < total.sum() / 1.76e-3 < 1.1  # one leg: the tables drop what is occluded from there
     assert float(estimate.diagnostics["occluded_share"]) == 0
