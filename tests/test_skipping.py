@@ -38,7 +38,7 @@ def test_both_sides_are_scenes_and_the_plans_tell_them_apart(skip):
     """Nothing is skipped in silence: the plan, its list of reasons, or the scene's structure differs."""
     files = list(sides(skip))
     plans = [plan_of(skip, file) for file in files]
-    structures = [jax.tree.structure(file.scene) for file in files]
+    structures = [(jax.tree.structure(f.scene), [x.shape for x in jax.tree.leaves(f.scene)]) for f in files]
     by_value = {"empty space", "unlit surfels", "invisible medium", "thin medium"}  # found while it runs
     assert plans[0] != plans[1] or structures[0] != structures[1] or skip.name in by_value
 
@@ -94,25 +94,26 @@ def test_a_homogeneous_medium_has_no_lookups_and_no_loop():
 
 
 def splat_pair(phase, *arguments):
-    row = {name: jnp.ones((1, 1)) for name in kernel.COLUMNS}
-    ray = tuple(jnp.ones((1, 1)) for _ in range(3))
+    row = dict(zip(kernel.COLUMNS, (0.3, 0.0, 0.0, -0.6, 0.0, 0.8, 0.0, 1e9, 1e-3, 1.0, 1.0, 1.0), strict=True))
+    row = {name: jnp.full((1, 1), value) for name, value in row.items()}
+    ray = tuple(jnp.full((1, 1), x) for x in (0.0, 0.0, 1.0))
     return kernel.pair_samples(ray, [jnp.ones((1, 1))], row, phase=phase, g=arguments[0] if arguments else None)[0]
 
 
 def test_g_0_leaves_the_phase_function_out():
     isotropic = operations(lambda g: splat_pair("isotropic", g), jnp.float32(0.0))
     forward = operations(lambda g: splat_pair("henyey_greenstein", g), jnp.float32(0.0))
-    assert sum(isotropic.values()) < 0.75 * sum(forward.values())
+    assert sum(isotropic.values()) < 0.8 * sum(forward.values()) and isotropic["mul"] < 0.75 * forward["mul"]
     closed = jax.make_jaxpr(lambda g: splat_pair("isotropic", g))(jnp.float32(0.0)).jaxpr
     assert closed.invars[0] not in {v for e in closed.eqns for v in e.invars if not hasattr(v, "val")}  # g is read by nobody
 
 
-def test_a_grey_medium_has_one_channel_of_weights():
+def test_a_grey_medium_has_one_weight_a_ray():
     def weights(grey):
         medium = medium_of(jnp.ones((4, 4, 4)))
         return interval_map.interval_map(medium, *RAYS, num_intervals=4, num_steps=8, grey=grey).weight
 
-    assert weights(True).shape[0] == 1 and weights(False).shape[0] == 3
+    assert weights(True).shape[0] == 1 and weights(False).shape[0] == 4  # one for all intervals, or one for each
 
 
 def test_cost_analysis_tells_the_homogeneous_medium_cheaper():
@@ -154,4 +155,4 @@ def test_gradients_of_equal_channels_stay_apart():
         return jnp.sum(found.weight[:, 0])
 
     slope = np.asarray(jax.grad(red)(jnp.ones(3)))
-    assert abs(slope[0]) > 1e-3 and np.all(slope[1:] == 0)
+    assert abs(slope[0]) > 1e-3 and np.all(np.abs(slope[1:]) < 1e-6)  # the others only move the samples

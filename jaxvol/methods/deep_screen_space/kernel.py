@@ -75,7 +75,8 @@ def pair_samples(
         elif phase == "henyey_greenstein":
             a = jnp.clip(mean_cosine, -MAX_ABS_G, MAX_ABS_G)
             x = (1.0 + a * a) * d2 + 2.0 * a * u * jnp.sqrt(d2)
-            x = jnp.maximum(x, (1.0 - jnp.abs(a)) * (1.0 - jnp.abs(a)) * d2)  # its least value, lost to rounding
+            # Its least value, lost to rounding; a little less, so that no tie at g = 0 halves the gradient.
+            x = jnp.maximum(x, 0.999 * (1.0 - jnp.abs(a)) * (1.0 - jnp.abs(a)) * d2)
             value = value / (x * jnp.sqrt(x))
         else:
             root = jnp.sqrt(d2)
