@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import lights
+from jaxvol import layers, lights
+from jaxvol import scene as scenes
 from jaxvol.methods import path_tracing
 from jaxvol.types import Mesh, Scene
 from tests import problems
@@ -41,7 +42,7 @@ def source(c):
         (0.5, 2, 61440),
         (0.9, 0, 15360),
         (0.9, 1, 49152),
-        pytest.param(0.99, 0, 24576, marks=pytest.mark.timeout(2400)),  # a hundred vertices a path
+        pytest.param(0.99, 0, 20480, marks=pytest.mark.timeout(2400)),  # a hundred vertices a path
     ],
 )
 def test_fluence_around_a_point_source(c, place, samples):
@@ -151,3 +152,26 @@ def test_a_constant_grid_equals_the_homogeneous_medium(case):
     (exact, exact_error), (value, error) = found
     assert_equal(exact, exact_error, exact, power=POWER)
     assert_equal(value, error, exact, power=POWER, exact_error=exact_error)
+
+
+def test_a_translucent_bunny_in_a_furnace_is_not_to_be_seen(shared_data):
+    """A body that only scatters, bounded by a mesh, in light of radiance 1 from everywhere; hundreds of short flights a path."""
+    file = scenes.make_scene(
+        {
+            "camera": {"origin": [-0.08, 0.19, 0.42], "target": [-0.017, 0.105, 0.0], "fov_y": 30.0, "width": 24, "height": 24},
+            "medium": {
+                "shape": str(shared_data / "meshes" / "stanford_bunny_16k_closed.ply"),
+                "scattering": [130.0, 118.0, 90.0],
+                "absorption": 0.0,
+                "anisotropy": 0.2,
+            },
+            "lights": [{"kind": "environment", "radiance": 1.0}],
+        }
+    )
+    plan = path_tracing.plan(file.scene, file.camera)
+    estimate = path_tracing.render(file.scene, file.camera, plan, samples=2048)
+    picture, variance = np.asarray(layers.total(estimate.mean)), np.asarray(estimate.variance.sums["+".join(layers.NAMES)])
+    body = np.asarray(estimate.mean.emission)[..., 0] < 0.999
+    assert body.sum() > 100
+    error = np.sqrt(variance[body].sum(axis=0, dtype=np.float64)) / body.sum()
+    assert_equal(picture[body].mean(axis=0, dtype=np.float64), error, 1.0, power=1.2e-3)
