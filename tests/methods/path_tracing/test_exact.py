@@ -155,7 +155,7 @@ def test_a_constant_grid_equals_the_homogeneous_medium(case):
 
 
 def test_a_translucent_bunny_in_a_furnace_is_not_to_be_seen(shared_data):
-    """A body that only scatters, bounded by a mesh, in light of radiance 1 from everywhere; hundreds of short flights a path."""
+    """A body that only scatters, bounded by a mesh, in light of radiance 1 from everywhere; hundreds of flights a path."""
     file = scenes.make_scene(
         {
             "camera": {"origin": [-0.08, 0.19, 0.42], "target": [-0.017, 0.105, 0.0], "fov_y": 30.0, "width": 24, "height": 24},
