@@ -114,7 +114,7 @@ def test_phase_function_stays_below_its_peak_for_lights_on_far_rays():
         inverse = 1.0 / jnp.sqrt(jnp.maximum(h2 + offset * offset, 1e-20))
         towards = tuple((offset * w - p) * inverse for w, p in zip(direction, perpendicular, strict=True))
         value = np.asarray(pairs.henyey_greenstein(pairs.dot(towards, direction), jnp.float32(g)))
-        assert np.isfinite(value).all() and value.max() <= peak * (1 + 1e-5)
+        assert np.isfinite(value).all() and value.max() <= peak * (1 + 1e-4)
 
 
 @pytest.mark.parametrize("g", [0.999, 0.99, 0.3, 0.0, -0.9])
