@@ -151,9 +151,6 @@ def test_bent_rays_scatter_anisotropically_as_straight_ones_do():
     name = "volume_from_light+volume_from_volume+volume_from_multiple"
     a, b = (np.asarray(x.mean.sums[name]) for x in (straight, bent))
     assert b.sum() == pytest.approx(a.sum(), rel=0.05)
-    even, _ = _picture(_scene(sigma_s=(0.8,) * 3, ior=jnp.float32(1.001)), corrections=0, resolution=24)  # by similarity alone
-    similar = sum(np.asarray(v) for _, v in items(even.mean))
-    assert abs(similar.sum() / a.sum() - 1) > 0.15
 
 
 def test_power_scales_the_picture(grey):
