@@ -243,7 +243,7 @@ def test_render_reflects_in_phong_lobes():
     table["lights"] = [{"kind": "directional", "direction": [0, -1, 1.5], "irradiance": 2.0}]
     file = make_scene(table)
     plan = impulse_response.plan(file.scene, file.camera, max_bounces=0)
-    found = impulse_response.render(file.scene, file.camera, plan, samples=8).mean.surface_from_light
+    found = impulse_response.render(file.scene, file.camera, plan, samples=256).mean.surface_from_light
     truth = direct.render(file.scene, file.camera, direct.plan(file.scene, file.camera)).mean.surface_from_light
     np.testing.assert_allclose(found, truth, rtol=0.05)
     assert np.ptp(np.asarray(truth)[..., 0]) > 0.1 * np.asarray(truth).mean()  # a highlight is in the picture
