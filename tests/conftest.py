@@ -1,5 +1,6 @@
 """Options that only tests and the command line may set, and fixtures that all tests share."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -17,6 +18,22 @@ CACHE = str(ROOT / ".pytest_cache" / "jax")
 os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+MAPS = Path("/proc/self/maps")
+MANY = 16_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Between modules, forget compiled programs where there are very many.
+
+    Each takes several of the 65,530 memory maps that Linux allows a process; beyond them the compiler crashes.
+    """
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MANY:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
