@@ -86,6 +86,7 @@ def test_local_visibility_finds_the_surfaces_close_by(scene, built):
     assert not np.any(hits[far]) and not np.any(face[far] >= 0)  # the least depth is a safe test
 
 
+@pytest.mark.slow
 def test_a_picture_with_maps_resembles_one_with_rays(scene):
     camera = make_camera(8)
     options = {"num_paths": 128, "num_levels": 1, "tile": 64}

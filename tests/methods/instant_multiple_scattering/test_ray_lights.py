@@ -36,6 +36,7 @@ def test_points_on_a_flight_have_their_pdf(start):
     assert values.max() < 1.05 * values.min()  # the pdf is that kernel: every sample has the same weight
 
 
+@pytest.mark.slow
 def test_infinite_medium():
     """The same exact radiance that the virtual points are tested with; no clamping, no compensation."""
     mean, error = radiance_past_the_source(sets=32, lights="rays")
