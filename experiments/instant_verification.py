@@ -137,7 +137,7 @@ def main():
         axes.axvline(0, color="k", lw=0.5)
         axes.axvspan(-1, 1, alpha=0.1)
         axes.set_yticks(y, [f"{r[0]}: {r[1]}" for r in rows])
-        axes.set_xlabel("difference of the mean from the reference, % (bars: one standard error)")
+        axes.set_xlabel("difference of the mean from the reference, %\n(bars: one standard error)")
 
 
 if __name__ == "__main__":

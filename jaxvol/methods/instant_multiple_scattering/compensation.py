@@ -99,7 +99,7 @@ def propose_near_light(
     1/(2 pi^2 sin(theta)) take that out, mixed with those of the phase function (one-sample MIS).
     """
     delta = target - points.position
-    r2 = jnp.maximum(sampling.dot(delta, delta), 1e-20)
+    r2 = jnp.maximum(sampling.dot(delta, delta), pairs.least_distance2(points.clamp))
     close = r2 < (_CLOSE * _CLOSE) * points.clamp * points.clamp
     if points.on_surface is not None:
         close = close & ~points.on_surface
@@ -260,14 +260,17 @@ def direct_light(
     if visible is not None:
         value = jnp.where(visible[:, None], value, 0.0)
     if scene.medium is not None:
-        column = receivers.column_between(scene.medium, points.position, _end(points.position, sample), num_steps=num_steps)
+        end = _end(scene.medium, points.position, sample)
+        column = receivers.column_between(scene.medium, points.position, end, num_steps=num_steps)
         value = value * jnp.exp(-column[:, None] * media.sigma_t(scene.medium))
     return value
 
 
-def _end(position, sample):
+def _end(medium, position, sample):
     """The light's position, or for an infinite one a point that is surely outside the medium."""
-    far = jnp.where(jnp.isfinite(sample.distance), sample.distance, 1e6)
+    low, high = medium.bounds
+    beyond = jnp.linalg.norm(high - low) + jnp.linalg.norm(position - low, axis=-1)
+    far = jnp.where(jnp.isfinite(sample.distance), sample.distance, beyond)
     return position + far[:, None] * sample.direction
 
 

@@ -130,7 +130,7 @@ def choose_point(
         weight = (b - a) * pairs.inverse_square(h2 + t * t, segments.clamp)
     else:
         t, weight = pairs.sample_along_ray(u, a, b, h2, segments.clamp)
-    inverse = lax.rsqrt(jnp.maximum(h2 + t * t, 1e-20))
+    inverse = lax.rsqrt(jnp.maximum(h2 + t * t, pairs.least_distance2(segments.clamp)))
     towards = tuple((t * w - p) * inverse for w, p in zip(direction, perpendicular, strict=True))
     return RayPoint(t + t_closest, weight, (h2 + t * t) * inverse, towards)
 
@@ -252,13 +252,10 @@ def gather_points(points: Points, lights: VirtualLights, medium: Medium, *, grey
         position, outgoing = pairs.components(position), pairs.components(outgoing)
 
         def evaluate(light, _, __):
-            delta = tuple(x - v for x, v in zip(position, light.position, strict=True))
-            r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
-            inverse = lax.rsqrt(r2)
-            towards = tuple(d * inverse for d in delta)
+            r2, distance, towards = pairs.separation(position, light.position, clamp)
             f = phase_value(medium, pairs.dot(towards, outgoing), isotropic=isotropic)
             sent = phase_value(medium, pairs.dot(light.direction, towards), isotropic=isotropic)
-            return pairs.inverse_square(r2, clamp) * (sent * f), r2 * inverse
+            return pairs.inverse_square(r2, clamp) * (sent * f), distance
 
         return sum_over(evaluate, rows(lights), sigma_t, position[0].shape[0], grey=grey)
 

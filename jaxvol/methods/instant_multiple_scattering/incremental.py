@@ -96,7 +96,8 @@ def touched_paths(
     last = np.append(np.asarray(vertices.path)[1:] != np.asarray(vertices.path)[:-1], True)[: len(face)]
     leaves = np.flatnonzero(last & np.asarray(vertices.continues))
     outgoing = np.asarray(vertices.outgoing)[leaves]
-    hit[leaves] |= _meets_moved(caster, end[leaves] + 1e-3 * outgoing, outgoing, moved_faces)
+    off = 1e-3 * float(ray_casting.scene_scale(scene.mesh))
+    hit[leaves] |= _meets_moved(caster, end[leaves] + off * outgoing, outgoing, moved_faces)
     missed = np.setdiff1d(paths, np.asarray(vertices.path))
     emitted = light_paths.emit(scene, jnp.asarray(light_paths.padded(missed.astype(np.uint32))), jnp.uint32(seed))
     origin, away = (np.asarray(x)[: len(missed)] for x in (emitted.origin, emitted.direction))

@@ -17,7 +17,8 @@ Vector = tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]
 
 GOLDEN = 0.6180339887498949
 _INV_4PI = 1.0 / (4.0 * math.pi)
-_TINY = 1e-12
+_CLOSEST = 1e-10  # of the squared clamp distance: closer pairs count as this far apart, so that no direction is 0/0
+_TINY = 1e-18  # the same where nothing is clamped; squares of its inverse stay within float32
 
 
 def components(v: Float[Array, "*n 3"]) -> Vector:
@@ -33,6 +34,21 @@ def dot(a: Vector, b: Vector) -> Float[Array, "*n"]:
 def combine(a: Vector, s: Float[Array, "*n"], b: Vector) -> Vector:
     """a + s b."""
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
+
+
+def least_distance2(clamp: Float[Array, "*n"] | None) -> Float[Array, "*n"] | float:
+    """Squared distance below which a pair has no direction, in proportion to the clamp distance."""
+    return _TINY if clamp is None else _CLOSEST * (clamp * clamp)
+
+
+def separation(
+    point: Vector, light: Vector, clamp: Float[Array, "*n"] | None
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Vector]:
+    """Squared distance of a pair, the distance, and the unit vector from the light to the point."""
+    delta = tuple(x - v for x, v in zip(point, light, strict=True))
+    r2 = jnp.maximum(dot(delta, delta), least_distance2(clamp))
+    inverse = lax.rsqrt(r2)
+    return r2, r2 * inverse, tuple(d * inverse for d in delta)
 
 
 def inverse_square(r2: Float[Array, "*n"], clamp: Float[Array, "*n"] | None) -> Float[Array, "*n"]:

@@ -169,22 +169,15 @@ def pick_for_points(
     sigma = 0.0 if medium is None else jnp.mean(media.sigma_t(medium)) * _mean_density(medium)
 
     def estimate(light, _):
-        delta, r2, inverse, towards = _between(position, light.position)
+        r2, distance, towards = pairs.separation(position, light.position, points.clamp)
         sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
         received = _mean(gathering.scattered(points, towards, medium, isotropic=isotropic))
         bounded = pairs.inverse_square(r2, points.clamp)
-        value = _mean(sent) * factor * received * bounded * jnp.exp(-jnp.minimum(sigma * r2 * inverse, _THICKEST))
+        value = _mean(sent) * factor * received * bounded * jnp.exp(-jnp.minimum(sigma * distance, _THICKEST))
         return value, (bounded,)
 
     light, scale, bounded = _pick(estimate, lights, u, num_groups, 1)
     return Picks(light, scale * bounded)
-
-
-def _between(position, light):
-    delta = tuple(x - v for x, v in zip(position, light, strict=True))
-    r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
-    inverse = lax.rsqrt(r2)
-    return delta, r2, inverse, tuple(d * inverse for d in delta)
 
 
 def _chosen(lights, index):
@@ -232,7 +225,7 @@ def evaluate_segments(
         index, weight, t, seen, column, clamp = item
         light: Light = _chosen(lights, index)
         x = segments.origin + t[:, None] * segments.direction
-        _, r2, _, towards = _between(pairs.components(x), light.position)
+        r2, _, towards = pairs.separation(pairs.components(x), light.position, segments.clamp)
         f = gathering.phase_value(medium, -pairs.dot(towards, direction), isotropic=isotropic)
         if clamp is not None:
             weight = weight * pairs.inverse_square(r2, clamp) / pairs.inverse_square(r2, segments.clamp)
@@ -271,7 +264,7 @@ def evaluate_points(
     def body(total, item):
         index, weight, seen, column = item
         light: Light = _chosen(lights, index)
-        _, _, _, towards = _between(position, light.position)
+        _, _, towards = pairs.separation(position, light.position, points.clamp)
         scale = weight if seen is None else weight * seen
         sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
         scale = scale * factor

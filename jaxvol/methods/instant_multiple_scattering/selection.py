@@ -130,13 +130,10 @@ def _along(segment, light, medium, soft, sigma, isotropic):
 def _reflected(point, light, medium, soft, sigma, isotropic):
     """What one point of a surface reflects of every light."""
     position = pairs.components(point.position)
-    delta = tuple(x - v for x, v in zip(position, light.position, strict=True))
-    r2 = jnp.maximum(pairs.dot(delta, delta), 1e-12)
-    inverse = lax.rsqrt(r2)
-    towards = tuple(d * inverse for d in delta)
+    r2, distance, towards = pairs.separation(position, light.position, soft)
     sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
     received = _mean(gathering.scattered(point, towards, medium, isotropic=isotropic))
-    depth = jnp.exp(-jnp.minimum(sigma * r2 * inverse, _THICKEST))
+    depth = jnp.exp(-jnp.minimum(sigma * distance, _THICKEST))
     return _mean(sent) * factor * received * pairs.inverse_square(r2, soft) * depth
 
 
@@ -201,9 +198,9 @@ def select(
 
 
 def _clamp(scene, plan):
-    """The clamp distance at the mean density."""
+    """The clamp distance at the mean density; hardly any where nothing is clamped."""
     if plan.mean_free_paths is None:
-        return jnp.float32(0.0)
+        return jnp.float32(1e-6 * plan.most_clamp)
     sigma = compensation.local_sigma(scene.medium, None, jnp.zeros((1, 3), jnp.float32))[0]
     return compensation.clamp_distance(sigma, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
 
