@@ -1,6 +1,6 @@
 """What direct light is asked to compute, decided once: layers, sample counts, what is skipped and why."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Plan:
     num_field_steps: int  # nodes on an eye ray in that field
     num_light_steps: int  # marching steps towards a light, through a grid
     rays_per_chunk: int
-    skipped: tuple[str, ...]  # what was skipped and why
+    skipped: tuple[str, ...] = field(compare=False)  # what was skipped and why
 
 
 def claims(scene: Scene) -> tuple[Claim, ...]:

@@ -22,7 +22,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "num_paths": 8, "max_depth": 4, "num_levels": 1, "num_chains": 1, "num_direct": 1, "tile": 64, "eye_steps": 16,
     },
     "impulse_response": {"samples": 1, "max_bounces": 2, "num_lanes": 64},
-    "lattice_boltzmann": {"resolution": 6, "surface_rays": 256, "samples_per_pixel": 1, "max_applications": 60},
+    "lattice_boltzmann": {"resolution": scenes.PARTS, "surface_rays": 256, "samples_per_pixel": 1, "max_applications": 60},
 }  # fmt: skip
 METHODS = tuple(OPTIONS)
 SAME = 2e-3  # relative L1 between pictures that may differ by rounding only

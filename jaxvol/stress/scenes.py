@@ -25,6 +25,7 @@ CLASSES: dict[str, Config] = {
 }
 GRID = 4  # voxels a side
 SIDE = 6  # pixels
+PARTS = 6  # voxels along the longest side of a medium where a method has voxels of its own
 _BOX = np.array([
     [0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4],
     [2, 6, 7], [2, 7, 3], [0, 4, 6], [0, 6, 2], [1, 3, 7], [1, 7, 5],
@@ -41,8 +42,10 @@ def random_scene(seed: int) -> tuple[str, Config]:
 def draw(name: str, rng: np.random.Generator) -> Config:
     """One scene of a class, lengths of about one."""
     kind = CLASSES[name]
-    low = -rng.uniform(0.6, 1.0, 3)
-    high = rng.uniform(0.6, 1.0, 3)
+    # A lattice of PARTS voxels along the longest side is 6 x 5 x 6 whatever the sides are, and stays so under a turn.
+    half = rng.uniform(0.7, 1.0) * (1.0 - np.array([0.0, rng.uniform(1.1, 1.9), rng.uniform(0.1, 0.9)]) / PARTS)
+    middle = rng.uniform(-0.2, 0.2, 3)
+    low, high = middle - half, middle + half
     config: Config = {"camera": _camera(rng, low, high), "lights": [], "shapes": []}
     furnace = name.endswith("furnace")
     if kind["medium"]:

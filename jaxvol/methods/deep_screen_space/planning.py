@@ -1,6 +1,6 @@
 """What a frame needs to know before it starts: options, static shapes, what the scene lets it skip."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -40,14 +40,16 @@ class Plan:
     grey: bool
     phase: str
     active: bool  # False: the layer is exactly zero
-    skipped: tuple[str, ...]
+    skipped: tuple[str, ...] = field(compare=False)
 
 
 def claims(scene: Scene) -> tuple[Claim, ...]:
     """`volume_from_surface`: complete, unless the medium bends rays (an index of refraction)."""
     partial = None
-    if scene.medium is not None and scene.medium.inclusions and any(
-        part.phase is not None for part in (scene.medium, *scene.medium.inclusions)
+    if (
+        scene.medium is not None
+        and scene.medium.inclusions
+        and any(part.phase is not None for part in (scene.medium, *scene.medium.inclusions))
     ):
         partial = "inclusions with a tabulated phase function scatter with the outer medium's, or by their mean cosine"
     if scene.medium is not None and scene.medium.ior is not None:
@@ -131,9 +133,7 @@ def plan(
         raise ValueError("weights = 'paper' are right-endpoint sums: position must be 'far' or 'jittered'")
     if weights == "paper" and scene.medium is not None and not segments.is_box(scene.medium):
         raise ValueError("weights = 'paper' are for one medium in its box, without boundary mesh or inclusions")
-    choices = lighting.light_choices(
-        scene, num_area_samples=num_area_samples, num_environment_samples=num_environment_samples
-    )
+    choices = lighting.light_choices(scene, num_area_samples=num_area_samples, num_environment_samples=num_environment_samples)
     skipped = _nothing_to_do(scene, choices)
     active = not skipped
     medium = scene.medium

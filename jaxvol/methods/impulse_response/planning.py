@@ -1,6 +1,6 @@
 """What the method claims of a scene, and what is decided before baking."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ class Plan:
     num_steps: int  # of marching a segment
     num_lanes: int
     caster: str
-    skipped: tuple[str, ...]
+    skipped: tuple[str, ...] = field(compare=False)
 
 
 def claims(scene: Scene) -> tuple[Claim, ...]:

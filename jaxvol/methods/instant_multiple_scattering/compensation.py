@@ -326,3 +326,14 @@ def coarse_density(density: Float[Array, "X Y Z"], *, block: int) -> np.ndarray:
 def clamp_distance(sigma: Float[Array, "*n"], *, mean_free_paths: float, most: float) -> Float[Array, "*n"]:
     """d = mean_free_paths / sigma, at most `most` (a length)."""
     return jnp.minimum(mean_free_paths / jnp.maximum(sigma, 1e-12), most)
+
+
+def most_clamp(scene: Scene, share: float) -> Float[Array, ""]:
+    """`share` of the longest side of all there is, a length; traced, so that scenes of all sizes share programs."""
+    corners = [] if scene.medium is None else [scene.medium.bounds]
+    if scene.mesh is not None and scene.mesh.vertices.shape[0]:
+        corners.append(scene.mesh.vertices)
+    if not corners:
+        return jnp.float32(share)
+    low, high = jnp.min(jnp.concatenate(corners), axis=0), jnp.max(jnp.concatenate(corners), axis=0)
+    return share * jnp.max(high - low)

@@ -1,6 +1,6 @@
 """What the method claims of a scene and what it decides before it runs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class Plan:
     max_depth: int
     lights: str
     mean_free_paths: float | None  # clamp distance times extinction; None = unclamped
-    most_clamp: float  # upper limit of the clamp distance, a length
+    most_clamp: float  # upper limit of the clamp distance over the longest side of the scene
     num_levels: int
     num_chains: int
     num_direct: int
@@ -56,7 +56,7 @@ class Plan:
     costly: bool  # a pair needs marching or a shadow ray: estimate all lights, evaluate picked ones
     volume: bool  # eye rays collect light in the medium
     surface: bool  # surfaces reflect light to the eye
-    skipped: tuple[str, ...]
+    skipped: tuple[str, ...] = field(compare=False)  # words with numbers in them: no reason to compile anew
 
 
 CHOICES = {
@@ -179,8 +179,6 @@ def plan(
     tracked = medium is not None and medium.density is not None
     if lights == "rays" and (tracked or scene.mesh is not None):
         raise ValueError("lights: 'rays' is not allowed here, it needs a homogeneous medium and no surfaces")
-    low, high = _extent(scene)
-    side = float(np.max(high - low))
     if num_levels is None:
         num_levels = _levels(scene, mean_free_paths) if values and scatters and scene.mesh is None else _MOST_LEVELS
     return Plan(
@@ -190,7 +188,7 @@ def plan(
         max_depth=max_depth,
         lights=lights,
         mean_free_paths=mean_free_paths,
-        most_clamp=0.1 * side if tracked or scene.mesh is not None else side,
+        most_clamp=0.1 if tracked or scene.mesh is not None else 1.0,
         num_levels=num_levels if mean_free_paths is not None and lights == "points" else 0,
         num_chains=num_chains,
         num_direct=num_direct,
@@ -243,17 +241,6 @@ def _is_dark(medium):
 def _is_black(mesh):
     brightest = float(np.max(np.asarray(mesh.albedo), initial=0.0))
     return brightest == 0.0 and (mesh.specular is None or float(np.max(np.asarray(mesh.specular), initial=0.0)) == 0.0)
-
-
-def _extent(scene):
-    corners = []
-    if scene.mesh is not None and scene.mesh.vertices.shape[0]:
-        corners += [np.min(np.asarray(scene.mesh.vertices), axis=0), np.max(np.asarray(scene.mesh.vertices), axis=0)]
-    if scene.medium is not None:
-        corners += list(np.asarray(scene.medium.bounds))
-    if not corners:
-        return np.zeros(3), np.ones(3)
-    return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
 def _eye_steps(medium):

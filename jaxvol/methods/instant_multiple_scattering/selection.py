@@ -200,9 +200,11 @@ def select(
 def _clamp(scene, plan):
     """The clamp distance at the mean density; hardly any where nothing is clamped."""
     if plan.mean_free_paths is None:
-        return jnp.float32(1e-6 * plan.most_clamp)
+        return 1e-6 * compensation.most_clamp(scene, plan.most_clamp)
     sigma = compensation.local_sigma(scene.medium, None, jnp.zeros((1, 3), jnp.float32))[0]
-    return compensation.clamp_distance(sigma, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
+    return compensation.clamp_distance(
+        sigma, mean_free_paths=plan.mean_free_paths, most=compensation.most_clamp(scene, plan.most_clamp)
+    )
 
 
 def _power(block):

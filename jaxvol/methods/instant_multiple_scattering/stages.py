@@ -81,7 +81,9 @@ def _segments(scene, mip, origin, direction, t_end, *, plan):
     clamp = None
     if plan.mean_free_paths is not None:
         thickest = jnp.mean(media.sigma_t(medium)) * (1.0 if mip is None else jnp.max(mip))
-        clamp = compensation.clamp_distance(thickest, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
+        clamp = compensation.clamp_distance(
+            thickest, mean_free_paths=plan.mean_free_paths, most=compensation.most_clamp(scene, plan.most_clamp)
+        )
     segments = Segments(origin, direction, t0, t1, clamp)
     if medium.density is None:
         return segments
@@ -93,7 +95,9 @@ def _segments(scene, mip, origin, direction, t_end, *, plan):
 def clamp_at(scene: Scene, mip: Float[Array, "x y z"] | None, position: Float[Array, "n 3"], *, plan: Plan):
     """Clamp distance at points: a function of the receiver alone, one for all channels, so that the split is exact."""
     sigma = compensation.local_sigma(scene.medium, mip, position)
-    return compensation.clamp_distance(sigma, mean_free_paths=plan.mean_free_paths, most=plan.most_clamp)
+    return compensation.clamp_distance(
+        sigma, mean_free_paths=plan.mean_free_paths, most=compensation.most_clamp(scene, plan.most_clamp)
+    )
 
 
 def gather_segments(context: Context, segments: Segments, index: UInt[Array, "n"]) -> Sums:

@@ -1,7 +1,7 @@
 """What the lattice is asked to compute, decided once from the scene's values: grid, lattice, channels, what is skipped."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class Plan:
     degree: int  # of the scattering between links: 0 isotropic or by similarity, else moments up to it (anisotropy.py)
     first_order: bool  # anisotropic scattering: the exact first order put back
     walls: bool  # opaque meshes inside the medium as diffuse walls of the lattice
-    skipped: tuple[str, ...]  # what was skipped and why; warnings begin with "warning:"
+    skipped: tuple[str, ...] = field(compare=False)  # what was skipped and why; warnings begin with "warning:"
 
 
 def claims(scene: Scene) -> tuple[Claim, ...]:
@@ -270,9 +270,9 @@ def _thickest(scene, extinction):
 def _one_spectrum(scene) -> bool:
     """Whether all lights that can reach the medium have the same colour and surfaces do not change it."""
     colours = []
-    for lights, field in (("point_lights", "intensity"), ("spot_lights", "intensity"), ("directional_lights", "irradiance")):
+    for lights, name in (("point_lights", "intensity"), ("spot_lights", "intensity"), ("directional_lights", "irradiance")):
         if getattr(scene, lights) is not None:
-            colours.append(np.asarray(getattr(getattr(scene, lights), field)))
+            colours.append(np.asarray(getattr(getattr(scene, lights), name)))
     if scene.environment is not None:
         colours.append(np.asarray(scene.environment.radiance).reshape(-1, 3))
     if scene.mesh is not None:

@@ -4,7 +4,7 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +33,7 @@ class Plan:
     max_spans: int
     caster: str
     drop_medium: bool  # the medium scatters and absorbs nothing
-    skipped: tuple[str, ...]
+    skipped: tuple[str, ...] = field(compare=False)
 
 
 def claims(scene: Scene) -> tuple[Claim, ...]:

@@ -79,7 +79,6 @@ def test_float_values_share_a_compilation():
     counts = []
     sizes = {"volume_first": 128, "volume_later": 128}
     for scene, plan in zip(settings, plans, strict=True):
-        plan = dataclasses.replace(plan, skipped=(), most_clamp=1.0)
         rendering.render_set(scene, camera, plan, seed=1, sizes=sizes)
         counts.append(rendering._volume_at_once._cache_size())
     assert counts[0] == counts[1]
