@@ -22,7 +22,8 @@ from jaxvol.scene import load_scene, make_scene
 
 HERE = Path(__file__).resolve().parent
 DATA = HERE.parent / "../shared/data"
-PAPER = {"image": False, "back_scattering": False, "occlusion": "drop", "contrast": None, "similarity": True, "g_range": 0.5}
+PAPER = {"image": False, "back_scattering": False, "occlusion": "drop", "contrast": None, "bounded": None}
+PAPER |= {"similarity": True, "g_range": 0.5}
 
 
 def write_csv(path, rows):
@@ -241,7 +242,7 @@ def lightmap_against_reference(out, quick):
     rows, pictures = [], {"path tracing": _atlas(what, truth)}
     cases = {
         "ours": {},
-        "no marching": {"occlusion": "drop"},
+        "tables alone": {"occlusion": "drop", "bounded": None},
         "paper": PAPER,
         "attenuated only": {"scattering": "attenuated"},
         "surface-only": {"scattering": "surface"},

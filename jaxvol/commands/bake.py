@@ -57,7 +57,13 @@ def bake(
     contrast: Annotated[
         float | None, typer.Option(help="Of density, above which a segment is marched; 1 = never.", min=0, max=1)
     ] = None,
-    legs: Annotated[int, typer.Option(help="Scatter points of a marched segment before the tables.", min=1)] = 1,
+    bounded: Annotated[
+        float | None,
+        typer.Option(help="Mean free paths across the medium, below which all is marched; 0 = never. Default: 10.", min=0),
+    ] = None,
+    legs: Annotated[
+        int | None, typer.Option(help="Scatter points of a marched segment before the tables. Default: 8 or 1.", min=1)
+    ] = None,
     similarity: Annotated[bool, typer.Option(help="Multiple scattering by similarity to an isotropic medium.")] = False,
     g_range: Annotated[float | None, typer.Option(help="Single scattering interpolated between three values of g.")] = None,
     harmonics: Annotated[bool, typer.Option(help="SH of incident light in the lightmap's channels.")] = True,
@@ -74,13 +80,16 @@ def bake(
     file = load_scene(scene, overrides=list(set_ or []))
     options = {"scattering": scattering.value, "max_bounces": max_bounces}
     if paper:
-        options |= {"image": False, "back_scattering": False, "occlusion": "drop", "contrast": None}
+        options |= {"image": False, "back_scattering": False, "occlusion": "drop"}
+        options |= {"contrast": None, "bounded": None}
         options |= {"similarity": True, "g_range": 0.5 if g_range is None else g_range}
     else:
         options |= {"image": image_source, "back_scattering": back_scattering, "occlusion": occlusion.value}
         options |= {"similarity": similarity, "g_range": g_range, "legs": legs}
         if contrast is not None:
             options["contrast"] = contrast if contrast < 1 else None
+        if bounded is not None:
+            options["bounded"] = bounded
     plan = impulse_response.plan(file.scene, None, **options)
     lookups = None if table_file is None else tables.load(table_file).lookups()
     jobs_of = {}

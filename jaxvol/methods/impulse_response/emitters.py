@@ -37,7 +37,7 @@ def _channels(parts):
 
 def _sigma(tau, distance):
     """Effective sigma_t of the segment, kept away from 0 where it is divided by."""
-    return jnp.maximum(tau / distance[..., None], 1e-6)
+    return jnp.maximum(tau, 1e-6) / distance[..., None]
 
 
 def _mirrored(responses, direction, distance, normal, sigma):

@@ -113,7 +113,8 @@ def bake(
     if plan.harmonics:
         diagnostics["harmonics"] = jnp.asarray(_shaped(sum(mean[name] for name in SURFACE)[:, 1:], shape))
     return Estimate(
-        mean=from_items({name: jnp.asarray(_shaped(_first(mean[name]), shape)) for name in SURFACE}),
+        # Image sources may take off a little more than there is: no light is negative.
+        mean=from_items({name: jnp.asarray(_shaped(np.maximum(_first(mean[name]), 0), shape)) for name in SURFACE}),
         variance=from_items({name: jnp.asarray(_shaped(_first(variance[name]), shape)) for name in SURFACE}),
         num_samples=jnp.float32(samples),
         diagnostics=diagnostics,

@@ -47,14 +47,20 @@ class Kit(eqx.Module):
     shares: tuple[float, float, float] = eqx.field(static=True, default=(1.0, 0.0, 0.0))
     march_occluded: bool = eqx.field(static=True, default=False)
     contrast: float | None = eqx.field(static=True, default=None)  # above it segments are marched; None = never
+    march_all: bool = eqx.field(static=True, default=False)  # the medium's bounds are near everywhere
     legs: int = eqx.field(static=True, default=1)  # scatter points of a marched segment before the tables
     multiple: bool = eqx.field(static=True, default=True)
     open: bool = eqx.field(static=True, default=False)  # all faces in one plane: nothing occludes
 
     @property
+    def tables_end(self) -> bool:
+        """Whether the receivers' own segments are all marched: nothing of them is looked up."""
+        return self.march_all and (self.march_occluded or self.open)
+
+    @property
     def marches(self) -> bool:
         """Whether any segment may be marched."""
-        return self.responses is not None and (self.march_occluded or self.contrast is not None)
+        return self.responses is not None and (self.march_occluded or self.march_all or self.contrast is not None)
 
 
 class Tally(dict):
@@ -115,7 +121,9 @@ def _occluded(kit, origin, direction, length):
 
 
 def by_marching(kit: Kit, position, normal, light: Light, visible: np.ndarray) -> np.ndarray:
-    """Which segments the tables do not fit: occluded ones where asked for, and those of much contrast."""
+    """Which segments the tables do not fit: all in a bounded medium, occluded ones where asked for, those of much contrast."""
+    if kit.march_all:
+        return visible | kit.march_occluded
     chosen = np.zeros(visible.shape, bool)
     if kit.march_occluded:
         chosen |= ~visible
@@ -157,7 +165,7 @@ def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light
             arguments = (medium, kit.responses, outward, again, lit, far, part.normal, *around)
             more = more + weight * marched.scattered_more(*arguments, image=kit.image)
         else:
-            outward, distance, factor = marched.onward(kit.marching, points, outward, take(draw(leg)), num_steps=steps)
+            outward, distance, factor = marched.onward(kit.marching, points, outward, again, take(draw(leg)), num_steps=steps)
             open_way = ~_occluded(kit, points, outward, distance)
             weight = weight * factor * jnp.asarray(open_way)[:, None]
             points = points + distance[:, None] * outward
@@ -200,14 +208,15 @@ def light_from(
     by_march = own and kit.marches
     chosen = by_marching(kit, position, receiver.normal, light, visible) if by_march else None
     direct = once = more = lost = None
+    responses = None if own and kit.tables_end else kit.responses
     if smooth:
         tau = thickness(kit, position, light.direction, light.distance)
-        direct, once, more = _arrivals(kit.responses, receiver, light, jnp.asarray(visible), tau, pick, image=kit.image)
-        if kit.responses is not None:
+        direct, once, more = _arrivals(responses, receiver, light, jnp.asarray(visible), tau, pick, image=kit.image)
+        if responses is not None:
             by_table = visible if chosen is None else visible & ~chosen
             dropped = ~visible if chosen is None else ~visible & ~chosen
             once, more, lost = _split(once, more, jnp.asarray(by_table), jnp.asarray(dropped))
-            beyond, lookups = _beyond(kit.responses, tau, jnp.asarray(by_table))
+            beyond, lookups = _beyond(responses, tau, jnp.asarray(by_table))
             tally.count(beyond=beyond, lookups=lookups)
         else:
             lost = jnp.zeros_like(direct)
@@ -282,7 +291,7 @@ def _marching_numbers(seed, item, sample, number, leg):
 
 
 def _step(kit, receiver, position, item, sample, seed, depth, tally):
-    """The next vertex: (what the receiver makes of a unit of its irradiance, the unscattered part, position, normal)."""
+    """The next vertex: (what the receiver makes of a unit of its irradiance, unscattered and scattered, position, normal)."""
     normal, mesh = receiver.normal, kit.scene.mesh
     arguments = (item, sample, seed, jnp.int32(depth), kit.probe_sigma)
     proposal = surface_paths.propose(mesh, kit.faces, position, normal, *arguments, shares=kit.shares)
@@ -295,6 +304,7 @@ def _step(kit, receiver, position, item, sample, seed, depth, tally):
         plumb = ~_occluded(kit, *arrival.plumb)
     tau = thickness(kit, position, arrival.direction, arrival.distance)
     chosen = response = None
+    responses = None if depth == 1 and kit.tables_end else kit.responses
     if depth == 1 and kit.marches:
         light = Light(arrival.direction, arrival.distance, jnp.ones_like(position), arrival.normal)
         sight = visible | np.asarray(proposal.technique == 0)
@@ -303,14 +313,14 @@ def _step(kit, receiver, position, item, sample, seed, depth, tally):
         once, more = march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, draw)
         response = once + more
         tally.count(segments=chosen.size, marched=int(chosen.sum()))
-    if kit.responses is not None:
+    if responses is not None:
         by_table = np.asarray(arrival.valid) & visible
-        beyond, lookups = _beyond(kit.responses, tau, jnp.asarray(by_table))
+        beyond, lookups = _beyond(responses, tau, jnp.asarray(by_table))
         tally.count(beyond=beyond, lookups=lookups)
-    step, plain = surface_paths.transport(
+    plain, scattered = surface_paths.transport(
         mesh,
         kit.faces,
-        kit.responses,
+        responses,
         receiver,
         proposal,
         arrival,
@@ -323,7 +333,7 @@ def _step(kit, receiver, position, item, sample, seed, depth, tally):
         shares=kit.shares,
         image=kit.image,
     )
-    return step, plain, arrival.position, arrival.normal
+    return plain, scattered, arrival.position, arrival.normal
 
 
 def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, tally: Tally) -> dict[str, Array]:
@@ -342,22 +352,22 @@ def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, ta
     kinds = (kit.scene.area_lights is not None) + (kit.scene.environment is not None)
     tally.count(traced=kinds * item.size)
     kinds += len({kind for kind, _ in delta_lights(kit.scene)})
-    whole = plain = rest = None
+    first_step = rest = None
     for depth in range(1, kit.max_bounces + 1):
-        step, unscattered, position, normal = _step(kit, receiver, position, item, sample, seed, depth, tally)
+        *step, position, normal = _step(kit, receiver, position, item, sample, seed, depth, tally)
         if depth == 1:
-            whole, plain, rest = step, unscattered, jnp.ones_like(position)
+            first_step, rest = step, jnp.ones_like(position)
         else:
-            rest = rest * step
+            rest = rest * (step[0] + step[1])
         if depth > 2:
-            rest = _survive(whole, rest, item, sample, seed, jnp.int32(depth))
+            rest = _survive(first_step, rest, item, sample, seed, jnp.int32(depth))
         receiver = Irradiance(normal)
         found = sampled_arrivals(kit, receiver, position, item, sample, seed, depth, tally=tally)
-        first, several = _collect(whole, plain if depth == 1 else None, rest, found)
-        if first is not None:
+        first, several = _collect(first_step, rest, found, split=depth == 1)
+        if depth == 1:
             layers["surface_from_surface"] = first
         layers["surface_from_multiple"] = layers["surface_from_multiple"] + several
-        alive = int(_count_alive(whole, rest))
+        alive = int(_count_alive(first_step, rest))
         tally.count(traced=(1 + kinds) * alive)
         if alive == 0:
             break
@@ -365,24 +375,23 @@ def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, ta
 
 
 @jax.jit
-def _count_alive(whole, rest):
-    return jnp.sum(jnp.any((rest != 0) & (first_row(whole) != 0), axis=-1))
+def _count_alive(first_step, rest):
+    return jnp.sum(jnp.any((rest != 0) & (first_row(first_step[0] + first_step[1]) != 0), axis=-1))
+
+
+@partial(jax.jit, static_argnames="split")
+def _collect(first_step, rest, found, *, split: bool):
+    """Light of one vertex at the receiver: (unscattered from one surface where `split`, else None; the rest)."""
+    plain, scattered = first_step
+    direct, more = rest * found[0], rest * (found[1] + found[2])
+    if not split:
+        return None, (plain + scattered) * like(direct + more, plain)
+    return plain * like(direct, plain), scattered * like(direct + more, plain) + plain * like(more, plain)
 
 
 @jax.jit
-def _collect(whole, plain, rest, found):
-    """Light of one vertex at the receiver: (from one surface alone or None, the rest)."""
-    arriving = rest * (found[0] + found[1] + found[2])
-    everything = whole * like(arriving, whole)
-    if plain is None:
-        return None, everything
-    first = plain * like(rest * found[0], plain)
-    return first, everything - first
-
-
-@jax.jit
-def _survive(whole, rest, item, sample, seed, depth):
+def _survive(first_step, rest, item, sample, seed, depth):
     """Russian roulette from the third vertex on; paths that lost end with weight 0."""
     u = sampling.uniforms(seed, _STREAM, item, 1000 + depth, sample)[0]
-    chance = jnp.clip(jnp.max(jnp.abs(first_row(whole) * rest), axis=-1), 0.1, 1.0)
+    chance = jnp.clip(jnp.max(jnp.abs(first_row(first_step[0] + first_step[1]) * rest), axis=-1), 0.1, 1.0)
     return rest * jnp.where(u < chance, 1 / chance, 0.0)[:, None]

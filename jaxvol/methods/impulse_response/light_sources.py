@@ -41,7 +41,7 @@ def see(scene, position, kind, index, u) -> Light:
     if kind in ("point", "spot"):
         group = scene.point_lights if kind == "point" else scene.spot_lights
         delta = group.position[index] - position
-        distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+        distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
         direction = delta / distance[:, None]
         strength = group.intensity[index]
         if kind == "spot":
@@ -60,7 +60,7 @@ def see(scene, position, kind, index, u) -> Light:
     a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
     w1, w2 = sampling.sample_triangle(u[0], u[1])
     delta = a + w1[:, None] * (b - a) + w2[:, None] * (c - a) - position
-    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
     emission = mesh.emission[face]
     density = lights.luminance(emission) / group.total  # 1/area
     normal = sampling.normalize(jnp.cross(b - a, c - a))
@@ -73,7 +73,7 @@ def see_again(scene, position, kind, index, light: Light, moved) -> Light:
     if light.infinite:
         return light
     delta = position + light.distance[:, None] * light.direction - moved
-    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
     direction = delta / distance[:, None]
     strength = light.strength
     if kind == "spot":
@@ -92,5 +92,5 @@ def shadow_ray(scale, position, normal, light: Light):
     if light.normal is not None:
         end = surface_paths.lifted(end, light.normal, scale)
     way = end - start
-    length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-20))
+    length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-30))
     return start, way / length[:, None], length * (1 - 1e-5)

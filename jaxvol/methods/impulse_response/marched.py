@@ -35,8 +35,8 @@ _COSINES, _TURNS, _DEPTHS = (0.9, 0.5, 0.15), 4, (0.125, 0.375, 0.625, 0.875)  #
 @jax.jit
 def surroundings(medium, where: "Place", normal, offset) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Height of points `offset` from the receiver over its surface, and mean extinction of the leg that reached it."""
-    sigma = jnp.mean(media.sigma_t(medium)) * where.near / jnp.maximum(where.distance, 1e-9)
-    return dot(offset, normal), jnp.maximum(sigma, 1e-6)
+    tau = jnp.mean(media.sigma_t(medium)) * where.near
+    return dot(offset, normal), jnp.maximum(tau, 1e-6) / jnp.maximum(where.distance, 1e-15)
 
 
 class Place(NamedTuple):
@@ -97,7 +97,7 @@ def place(marching, position, normal, light: Light, u, *, num_steps: int) -> Pla
     )
     rest = light.distance[:, None] * light.direction - t[:, None] * direction
     # dt dmu dphi = (4 r^2 / d) da dw dphi, over the triangle's area and all azimuths; `density` is over density of the medium.
-    angles = light.distance / (4 * jnp.maximum(dot(rest, rest), 1e-12)) / (pi**3 / 4)
+    angles = light.distance / (4 * jnp.maximum(dot(rest, rest), 1e-30)) / (pi**3 / 4)
     flight = jnp.where(dot(direction, normal) > 0, density / (2 * pi), 0.0)
     rho = extinction.region_density(marching, 0, position + t[:, None] * direction)
     pdf = 0.5 * (angles + flight * rho)
@@ -139,13 +139,28 @@ def _free_flight(marching, origin, direction, u, num_steps, given=None):
 
 
 @partial(jax.jit, static_argnames="num_steps")
-def onward(marching, points, direction, u, *, num_steps: int):
-    """The next leg outward from scatter points: (direction, distance, factor of throughput [n, 3])."""
+def onward(marching, points, direction, light: Light, u, *, num_steps: int):
+    """The next leg outward from scatter points that see `light`: (direction, distance, factor of throughput [n, 3]).
+
+    Its direction by the phase function, its length by free flight, and for emitters at a finite distance half of the times
+    equi-angular about them: the next connection's 1/r^2 would have an infinite variance otherwise.
+    """
     medium = marching.regions[0]
     turned, _ = phase.sample(medium, direction, u[0], u[1])
-    t, column, density = _free_flight(marching, points, turned, u[2], num_steps)
+    if light.infinite:
+        t, column, density = _free_flight(marching, points, turned, u[2], num_steps)
+        weight = jnp.where(density > 0, 1 / jnp.maximum(density, 1e-30), 0.0)
+    else:
+        t0, t1 = media.box_interval(medium.bounds, points, turned)
+        emitter = points + light.distance[:, None] * light.direction
+        near, _ = sampling.sample_equiangular(u[2], points, turned, t0, t1, emitter)
+        given = jnp.where(u[3] < 0.5, near, jnp.inf)
+        t, column, density = _free_flight(marching, points, turned, u[2], num_steps, given=given)
+        rho = extinction.region_density(marching, 0, points + t[:, None] * turned)
+        even = sampling.sample_equiangular_pdf(t, points, turned, t0, t1, emitter)
+        weight = rho / jnp.maximum(0.5 * (density * rho + even), 1e-30)
     through = medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None])
-    return turned, t, through * jnp.where(density > 0, 1 / jnp.maximum(density, 1e-30), 0.0)[:, None]
+    return turned, t, through * weight[:, None]
 
 
 def _phase_lobe(medium, order):
@@ -240,7 +255,7 @@ def _mirrored(responses, normal, height, sigma, light, far):
     way = light.distance[:, None] * light.direction
     above = height + dot(way, normal)
     way = way - 2 * (above + behind)[:, None] * normal
-    distance = jnp.sqrt(jnp.maximum(dot(way, way), 1e-12))
+    distance = jnp.sqrt(jnp.maximum(dot(way, way), 1e-30))
     turned = None if light.normal is None else light.normal - 2 * dot(light.normal, normal)[:, None] * normal
     thick = far + ((distance - light.distance) * sigma)[:, None]
     return Light(way / distance[:, None], distance, light.strength, turned), jnp.maximum(thick, 0.0)

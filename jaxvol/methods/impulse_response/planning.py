@@ -9,12 +9,14 @@ import numpy as np
 from jaxvol import extinction, lights, media, ray_casting, segments, tables, zonal_lookup
 from jaxvol.layers import SURFACE, Claim
 from jaxvol.methods.impulse_response import gather, lookup, surface_paths
-from jaxvol.types import Camera, Medium, Scene
+from jaxvol.types import Camera, Medium, Mesh, Scene
 
 Scattering = Literal["surface", "attenuated", "single", "multiple"]
 Occlusion = Literal["march", "drop"]
 _MODES = ("surface", "attenuated", "single", "multiple")
 CONTRAST = 0.5  # of density along a segment, above which it is marched
+BOUNDED = 10.0  # mean free paths across the medium, below which its bounds count everywhere
+_LEGS = 8  # of marched segments in a bounded medium: scatter points before the tables' infinite medium takes over
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class Plan:
     image: bool
     march_occluded: bool  # segments that an occluder cuts are integrated, not dropped
     contrast: float | None  # of density, above which a segment is integrated; None = never
+    march_all: bool  # the medium ends within few mean free paths: all segments are integrated
     legs: int  # scatter points of a marched segment before the tables take over
     similarity: bool
     g_range: float | None
@@ -77,7 +80,8 @@ def plan(
     back_scattering: bool = True,
     occlusion: Occlusion = "march",
     contrast: float | None = CONTRAST,
-    legs: int = 1,
+    bounded: float | None = BOUNDED,
+    legs: int | None = None,
     similarity: bool = False,
     g_range: float | None = None,
     harmonics: bool = False,
@@ -96,8 +100,10 @@ def plan(
             leg by last leg; "drop" is the paper's rule, and its share is reported.
         contrast: of density about a receiver's segment, (max - min) / max, above which it is integrated with marched sigma;
             None = never, the paper's mode.
-        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64. More follow light around
-            occluders further, but from the second on lamps inside the medium make them noisy (1 / r^2).
+        bounded: mean free paths across the thinnest side of a medium's box, below which all segments of receivers are
+            integrated inside its bounds, since the tables know an infinite medium only; None = never, the paper's mode.
+        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64; None = 8 in a bounded medium,
+            else 1. More follow light around occluders and along bounds further, at the price of noise.
         similarity: the paper's map of light scattered twice or more to an isotropic medium.
         g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
         harmonics: also bake SH of incident radiance.
@@ -114,7 +120,9 @@ def plan(
         raise ValueError(f"occlusion: {occlusion!r} is not allowed, must be march or drop")
     if contrast is not None and not 0 <= contrast <= 1:
         raise ValueError(f"contrast: {contrast} is not allowed, must be 0 to 1")
-    if not 1 <= legs <= 64:
+    if bounded is not None and not bounded >= 0:
+        raise ValueError(f"bounded: {bounded} is not allowed, must be >= 0")
+    if legs is not None and not 1 <= legs <= 64:
         raise ValueError(f"legs: {legs} is not allowed, must be 1 to 64")
     if g_range is not None and not 0 < g_range < 1:
         raise ValueError(f"g_range: {g_range} is not allowed, must lie in (0, 1)")
@@ -151,7 +159,10 @@ def plan(
     if heterogeneous and not segments.is_box(medium):
         skipped.append("contrast is not measured in media with boundaries or inclusions: their mean serves")
         heterogeneous = False
-    if scatters and not heterogeneous:
+    march_all = scatters and bounded is not None and segments.is_box(medium) and _mean_free_paths(medium) < bounded
+    if march_all:
+        heterogeneous = False
+    elif scatters and not heterogeneous:
         skipped.append("no density varies along segments: none is marched for its contrast")
     if not (scatters and back_scattering):
         skipped.append("no probes for back-scattering: next vertices by cosine-distributed rays alone")
@@ -163,14 +174,15 @@ def plan(
         image=image and scattering == "multiple",
         march_occluded=scatters and occlusion == "march" and not bare and segments.is_box(medium),
         contrast=contrast if heterogeneous else None,
-        legs=legs,
+        march_all=march_all,
+        legs=legs or (_LEGS if march_all else 1),
         similarity=similarity,
         g_range=g_range,
         harmonics=harmonics,
         open=bare,
         max_bounces=max_bounces,
         shares=(0.6, 0.25, 0.15) if scatters and back_scattering else (1.0, 0.0, 0.0),
-        probe_sigma=_probe_sigma(medium),
+        probe_sigma=_probe_sigma(scene.mesh, medium),
         num_steps=1 if medium is None else max(1, extinction.num_voxels_across(medium)),
         num_lanes=num_lanes,
         caster=caster,
@@ -187,13 +199,24 @@ def _refuse_refraction(medium: Medium) -> None:
             )
 
 
-def _probe_sigma(medium: Medium | None) -> float:
-    """Mean extinction of the thinnest channel that is not empty: how far scattered light travels along a surface."""
+def _mean_free_paths(medium: Medium) -> float:
+    """Across the thinnest side of the medium's box, for its mean density and the mean of its channels."""
+    density = 1.0 if medium.density is None else float(np.mean(np.asarray(medium.density)))
+    side = float(np.diff(np.asarray(medium.bounds, np.float64), axis=0).min())
+    return float(np.mean(np.asarray(media.sigma_t(medium), np.float64))) * density * side
+
+
+def _probe_sigma(mesh: Mesh, medium: Medium | None) -> float:
+    """Mean extinction of the thinnest channel that is not empty: how far scattered light travels along a surface.
+
+    At least one over the surfaces' extent: probes beyond it find nothing.
+    """
     if medium is None:
         return 1.0
+    extent = float(np.ptp(np.asarray(mesh.vertices, np.float64), axis=0).max())
     sigma = np.asarray(media.sigma_t(medium), np.float64)
     density = 1.0 if medium.density is None else float(np.mean(np.asarray(medium.density)))
-    return float(np.float32(max(density * sigma[sigma > 0].min(), 1e-6)))
+    return float(np.float32(max(density * sigma[sigma > 0].min(), 1 / extent)))
 
 
 def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTables | None = None) -> gather.Kit:
@@ -228,6 +251,7 @@ def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTable
         shares=plan.shares,
         march_occluded=plan.march_occluded,
         contrast=plan.contrast,
+        march_all=plan.march_all,
         legs=plan.legs,
         multiple=plan.scattering == "multiple",
         open=plan.open,

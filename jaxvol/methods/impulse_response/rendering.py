@@ -55,7 +55,8 @@ def render(
     for name in SURFACE:
         average = mean[name] / samples
         spread = np.maximum(square[name] / samples - average**2, 0) / max(samples - 1, 1)
-        means[name] = jnp.asarray(average.astype(np.float32).reshape(shape))
+        # As in `estimate.bake`, no light is negative.
+        means[name] = jnp.asarray(np.maximum(average, 0).astype(np.float32).reshape(shape))
         variances[name] = jnp.asarray(spread.astype(np.float32).reshape(shape))
     return Estimate(mean=from_items(means), variance=from_items(variances), num_samples=jnp.float32(samples))
 

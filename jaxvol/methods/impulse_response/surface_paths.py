@@ -83,7 +83,7 @@ def sampled_faces(mesh: Mesh) -> Faces:
 
 def lifted(position: Float[Array, "*b 3"], normal: Float[Array, "*b 3"], scale: Float[Array, ""]) -> Float[Array, "*b 3"]:
     """The point moved off its surface to the side of its normal, so that rays do not meet that surface."""
-    return position + (_LIFT * jnp.maximum(scale, 1e-3)) * normal
+    return position + (_LIFT * scale) * normal
 
 
 @partial(jax.jit, static_argnames="shares")
@@ -149,15 +149,15 @@ def arrive(
     against = jnp.where(dot(geometric, proposal.direction) > 0, -1.0, 1.0)
     facing = geometric * jnp.where(by_area, proposal.side, against)[:, None]
     delta = point - position
-    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-12))
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
     start, end = lifted(position, normal, faces.scale), lifted(point, facing, faces.scale)
     way = end - start
-    length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-20))
+    length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-30))
     height = dot(delta, normal)
     lateral = delta - height[:, None] * normal
     room = 0.25 / probe_sigma - height
     # Nearer than the rays' offset, directions from the point and from the ray disagree: in an edge the pdf would vanish.
-    apart = distance > 8 * _LIFT * jnp.maximum(faces.scale, 1e-3)
+    apart = distance > 8 * _LIFT * faces.scale
     return Arrival(
         valid=(by_area | hits.valid) & apart,
         face=chosen,
@@ -171,7 +171,7 @@ def arrive(
             -normal,
             jnp.maximum(room - 2 * _LIFT * faces.scale, 0.0),
         ),
-        radius=jnp.sqrt(jnp.maximum(dot(lateral, lateral), 1e-12)),
+        radius=jnp.sqrt(jnp.maximum(dot(lateral, lateral), 1e-30)),
     )
 
 
@@ -193,9 +193,9 @@ def transport(
     shares: tuple[float, float, float],
     image: bool,
 ) -> tuple[Float[Array, "n *rows 3"], Float[Array, "n *rows 3"]]:
-    """albedo / pi K / pdf of the step: (all of it, the part that is not scattered on the way).
+    """albedo / pi K / pdf of the step: (what is not scattered on the way, what is).
 
-    Where `by_marching`, `marched` stands for the tables' response.
+    Where `by_marching`, `marched` stands for the tables' response; everywhere where `responses` is None.
     """
     normal, technique = receiver.normal, proposal.technique
     visible = visible | (technique == 0)
@@ -219,7 +219,7 @@ def transport(
     through = 1.0 if tau is None else jnp.exp(-tau)
     plain = receiver.straight(arrival.direction, weight * spread[:, None] * through)
     if responses is None:
-        return plain, plain
+        return plain, jnp.zeros_like(plain) if marched is None else like(weight, marched) * marched
     once, more = emitters.patch_arrivals(
         responses, receiver, arrival.direction, arrival.distance, arrival.normal, tau, image=image, pick=proposal.pick
     )
@@ -228,7 +228,7 @@ def transport(
     response = jnp.where(seen, response, 0.0)
     if marched is not None:
         response = jnp.where(by_marching.reshape(seen.shape), marched, response)
-    return plain + like(weight, response) * response, plain
+    return plain, like(weight, response) * response
 
 
 def surface_reflectance(mesh: Mesh, face: Int[Array, "n"]) -> Float[Array, "n 3"]:

@@ -200,6 +200,8 @@ def test_bad_input():
         ({"num_lanes": 0}, "num_lanes: 0"),
         ({"occlusion": "grid"}, "occlusion: 'grid'"),
         ({"contrast": 2.0}, "contrast: 2.0"),
+        ({"bounded": -1.0}, "bounded: -1.0"),
+        ({"legs": 0}, "legs: 0"),
         ({"g_range": 1.0}, "g_range: 1.0"),
     ):
         with pytest.raises(ValueError, match=text):

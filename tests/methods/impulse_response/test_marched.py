@@ -11,7 +11,8 @@ from jaxvol.methods import impulse_response
 from jaxvol.methods.impulse_response import marched
 from jaxvol.methods.impulse_response.light_sources import Light
 from jaxvol.types import DirectionalLights, Medium, Mesh
-from tests.methods.impulse_response.test_irradiance import found, open_plane, receivers
+from tests import problems
+from tests.methods.impulse_response.test_irradiance import REFERENCE, found, open_plane, receivers
 
 WALL = np.array([[0.5, -3, 0], [0.5, 3, 0], [0.5, 3, 1.5], [0.5, -3, 1.5]], np.float32)
 
@@ -25,14 +26,14 @@ def behind_a_wall(c):
 
 def always(scene, **options):
     """A plan that marches every segment of the receivers."""
-    return dataclasses.replace(impulse_response.plan(scene, None, max_bounces=0, **options), contrast=-1.0)
+    return impulse_response.plan(scene, None, max_bounces=0, bounded=np.inf, **options)
 
 
 @pytest.mark.parametrize("g", [0.0, 0.5])
 def test_marching_a_homogeneous_medium_gives_the_tables_single_scattering(g):
     scene = open_plane(0.9, g)
     looked_up = found(impulse_response.irradiance(scene, *receivers(), samples=1, max_bounces=0), "surface_from_volume")
-    estimate = impulse_response.irradiance(scene, *receivers(), plan=always(scene), samples=16384)
+    estimate = impulse_response.irradiance(scene, *receivers(), plan=always(scene, legs=1), samples=16384)
     error = np.sqrt(np.asarray(estimate.variance.surface_from_volume)[:, 0])
     assert np.all(np.abs(found(estimate, "surface_from_volume") - looked_up) < 4 * error + 4e-3 * looked_up)
     assert error.sum() < 0.02 * looked_up.sum() and float(estimate.diagnostics["marched_share"]) == 1
@@ -44,11 +45,42 @@ def test_marching_sunlight_gives_the_tables_single_scattering():
     sun = DirectionalLights(jnp.array([[0.0, 0.0, -1.0]]), jnp.ones((1, 3)))
     scene = open_plane(0.9, medium=medium, point_lights=None, directional_lights=sun)
     points, normals = np.zeros((1, 3), np.float32), np.float32([[0, 0, 1]])
-    looked_up = found(impulse_response.irradiance(scene, points, normals, samples=1, max_bounces=0), "surface_from_volume")
-    estimate = impulse_response.irradiance(scene, points, normals, plan=always(scene), samples=16384)
+    options = {"samples": 1, "max_bounces": 0, "bounded": None}
+    looked_up = found(impulse_response.irradiance(scene, points, normals, **options), "surface_from_volume")
+    estimate = impulse_response.irradiance(scene, points, normals, plan=always(scene, legs=1), samples=16384)
     error = np.sqrt(np.asarray(estimate.variance.surface_from_volume)[:, 0])
     assert np.abs(found(estimate, "surface_from_volume") - looked_up) < 4 * error + 2e-3 * looked_up
     assert error < 0.02 * looked_up
+
+
+def slab_in_the_sun(tau):
+    """A white slab on a black plane, so wide that its sides do not matter."""
+    medium = Medium(jnp.array([[-40.0, -40, 0], [40, 40, tau]]), jnp.ones(3), jnp.zeros(3), jnp.float32(0.0))
+    sun = DirectionalLights(jnp.array([[0.0, 0.0, -1.0]]), jnp.ones((1, 3)))
+    return open_plane(1.0, medium=medium, point_lights=None, directional_lights=sun)
+
+
+@pytest.mark.parametrize("slab", problems.SLABS[:2], ids=lambda slab: f"tau {slab.tau}")
+def test_bounded_media_are_marched_inside_their_bounds(slab):
+    """T4: the total transmittance of a slab is the irradiance below it; the tables take it for a half-space."""
+    scene = slab_in_the_sun(slab.tau)
+    points, normals = np.zeros((1, 3), np.float32), np.float32([[0, 0, 1]])
+    assert impulse_response.plan(scene, None).march_all and not impulse_response.plan(scene, None, bounded=None).march_all
+    estimate = impulse_response.irradiance(scene, points, normals, samples=32768, max_bounces=0, legs=16)
+    parts = [np.asarray(getattr(estimate.variance, name))[0, 0] for name in layers.SURFACE]
+    error = np.sqrt(np.sum(parts) + 2 * np.sqrt(np.prod(parts[2:])))  # layers of one path go together at worst
+    assert error < 0.01 * slab.transmittance
+    assert abs(np.asarray(layers.total(estimate.mean))[0, 0] - slab.transmittance) < 4 * error
+
+
+def test_legs_towards_a_lamp_keep_the_light():
+    """Many legs, half of them equi-angular about the lamp, against the path tracer."""
+    scene = open_plane(0.5)
+    estimate = impulse_response.irradiance(scene, *receivers(), plan=always(scene), samples=16384)
+    once, rest = REFERENCE[0.5, 0.0, 0.0]
+    error = np.sqrt(np.asarray(estimate.variance.surface_from_multiple)[:, 0])
+    assert np.all(error[:4] < 0.05 * np.array(rest[:4]))
+    assert found(estimate, "surface_from_multiple").sum() == pytest.approx(sum(rest), rel=0.04)
 
 
 def test_contrast_is_measured_around_segments():
