@@ -35,8 +35,10 @@ _COSINES, _TURNS, _DEPTHS = (0.9, 0.5, 0.15), 4, (0.125, 0.375, 0.625, 0.875)  #
 @jax.jit
 def surroundings(medium, where: "Place", normal, offset) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """Height of points `offset` from the receiver over its surface, and mean extinction of the leg that reached it."""
-    tau = jnp.mean(media.sigma_t(medium)) * where.near
-    return dot(offset, normal), jnp.maximum(tau, 1e-6) / jnp.maximum(where.distance, 1e-15)
+    sigma = jnp.mean(media.sigma_t(medium))
+    reached = where.distance > 0  # not where the way misses the medium
+    leg = jnp.maximum(sigma * where.near, 1e-6) / jnp.where(reached, where.distance, 1.0)
+    return jnp.maximum(dot(offset, normal), 0.0), jnp.where(reached, leg, sigma)
 
 
 class Place(NamedTuple):
