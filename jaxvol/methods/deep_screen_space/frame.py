@@ -9,17 +9,25 @@ import numpy as np
 from jaxvol import ray_casting
 from jaxvol.common_stages import CommonStages
 from jaxvol.layers import zeros
-from jaxvol.methods.deep_screen_space import framebuffer, lighting, reconstruction, splatting, surfels, tile_lists, transport
+from jaxvol.methods.deep_screen_space import (
+    bounce,
+    framebuffer,
+    lighting,
+    reconstruction,
+    splatting,
+    surfels,
+    tile_lists,
+    transport,
+)
 from jaxvol.methods.deep_screen_space.camera_rays import ActiveRays, map_rays, transmittance_of
 from jaxvol.methods.deep_screen_space.lighting import LitSurfels
-from jaxvol.methods.deep_screen_space.planning import LAYER, Plan, coarse_size, group_size
+from jaxvol.methods.deep_screen_space.planning import BOUNCE_LAYER, LAYER, Plan, coarse_size, group_size
+from jaxvol.methods.deep_screen_space.surfels import Surfels
 from jaxvol.types import Camera, Estimate, Layers, Scene
 
 
-def light_surfels(
-    scene: Scene, camera: Camera, plan: Plan, common: CommonStages, *, seed: int
-) -> tuple[LitSurfels, LitSurfels | None, int]:
-    """Stages 1 and 2: lit Lambertian entries, glossy ones or None, and the number of surfels that found no slot."""
+def make_surfels(scene: Scene, camera: Camera, plan: Plan) -> tuple[Surfels, int]:
+    """Stage 1: the surfels, and the number of those that found no slot."""
     eye = np.asarray(camera.world_from_camera)[:3, 3]
     triangles = surfels.subdivide(
         scene.mesh.vertices, scene.mesh.faces, eye, num_surfels=plan.num_surfels, pattern=plan.pattern
@@ -28,7 +36,14 @@ def light_surfels(
     padded = jax.tree.map(lambda a: np.concatenate([a, np.zeros((spare, *a.shape[1:]), a.dtype)]), triangles)
     capacity = coarse_size(int(triangles.count.sum()))
     cloud, lost = surfels.tessellate(padded, capacity=capacity, pattern=plan.pattern)
-    lambert, glossy = lighting.illuminate(
+    return cloud, int(lost)
+
+
+def light_surfels(
+    scene: Scene, cloud: Surfels, plan: Plan, common: CommonStages, *, seed: int
+) -> tuple[LitSurfels, LitSurfels | None]:
+    """Stage 2: lit Lambertian entries, and glossy ones or None."""
+    return lighting.illuminate(
         scene,
         cloud,
         common.caster,
@@ -37,7 +52,19 @@ def light_surfels(
         choices=plan.light_choices,
         scale=float(ray_casting.scene_scale(scene.mesh)),
     )
-    return lambert, glossy, int(lost)
+
+
+def bounce_light(scene: Scene, lit: LitSurfels, cloud: Surfels, plan: Plan, common: CommonStages, *, seed: int) -> LitSurfels:
+    """Lambertian entries with what the surfels `lit` send to all others (a second bounce)."""
+    return bounce.illuminate(
+        padded_surfels(lit, plan),
+        cloud,
+        scene.mesh,
+        common.caster,
+        _transmittance(common, num_steps=plan.light_steps),
+        seed=seed,
+        num_connections=plan.second_bounce,
+    )
 
 
 def _transmittance(common, *, num_steps):
@@ -169,7 +196,7 @@ def render(
     common: CommonStages | None = None,
 ) -> Estimate:
     """The layer `volume_from_surface` of one frame, [H, W, 3]; `on_stage(name)` is called after each part of a stage,
-    `common` holds what other methods have computed already.
+    `common` holds what other methods have computed already. With a second bounce also its share of `volume_from_multiple`.
 
     Diagnostics: pairs evaluated by level, lit entries, active pixels; `overflow` counts surfels without a slot and rays
     with too many boundaries (0 in a healthy frame).
@@ -181,27 +208,49 @@ def render(
 
     done = _nothing if on_stage is None else report
     shape = (camera.height, camera.width)
-    nothing = Estimate(mean=zeros((LAYER,), shape), diagnostics={"overflow": jnp.int32(0)})
+    names = (LAYER, BOUNCE_LAYER) if plan.second_bounce else (LAYER,)
+    nothing = Estimate(mean=zeros(names, shape), diagnostics={"overflow": jnp.int32(0)})
     if not plan.active:
         return nothing
     common = CommonStages(scene, camera) if common is None else common
-    lambert, glossy, lost = light_surfels(scene, camera, plan, common, seed=seed)
+    cloud, lost = make_surfels(scene, camera, plan)
+    lambert, glossy = light_surfels(scene, cloud, plan, common, seed=seed)
     done("surfels", None)
-    entries = [lit for lit in (lambert, glossy) if lit is not None and lit.area.shape[0] > 0]
-    if not entries:
+    entries = {LAYER: _lit_ones(lambert, glossy)}
+    if not entries[LAYER]:
         return nothing
+    if plan.second_bounce:
+        again = bounce_light(scene, lambert, cloud, plan, common, seed=seed) if lambert.area.shape[0] else None
+        entries[BOUNCE_LAYER] = _lit_ones(again)
+        done("bounce", None)
     active = map_rays(scene, camera, plan, common, seed=seed)
     done("map", None)
     if active is None:
         return nothing
-    num_pixels = camera.height * camera.width
-    target = active.pixel[: active.num_rays]
-    levels = [jnp.zeros((num_pixels, 3), jnp.float32)] * plan.num_levels
     diagnostics = {
         "overflow": jnp.int32(lost + active.num_overflows),
         "active_pixels": jnp.int32(active.num_rays),
-        "surfels": jnp.int32(sum(lit.area.shape[0] for lit in entries)),
+        "surfels": jnp.int32(sum(lit.area.shape[0] for lit in entries[LAYER])),
     }
+    images = {}
+    for name, senders in entries.items():
+        images[name], counts = _image(scene, camera, active, senders, plan, common, seed=seed, done=done)
+        for key, count in counts.items():
+            diagnostics[key] = diagnostics.get(key, 0) + count
+    return Estimate(mean=Layers(**images), diagnostics=diagnostics)
+
+
+def _lit_ones(*entries):
+    return [lit for lit in entries if lit is not None and lit.area.shape[0] > 0]
+
+
+def _image(scene, camera, active, entries, plan, common, *, seed, done):
+    """Stages 4 to 8: what all `entries` send through the samples, [H, W, 3], and the pairs evaluated by level."""
+    shape = (camera.height, camera.width)
+    num_pixels = camera.height * camera.width
+    target = active.pixel[: active.num_rays]
+    levels = [jnp.zeros((num_pixels, 3), jnp.float32)] * plan.num_levels
+    evaluated = {}
     for lit in entries:
         lit = padded_surfels(lit, plan)
         done("order", None)
@@ -212,10 +261,10 @@ def render(
             levels[level] = levels[level] + reconstruction.unshuffle(tiles, slot, target, num_pixels=num_pixels)
         done("unshuffle", levels)
         for name, count in counts.items():
-            diagnostics[name] = diagnostics.get(name, 0) + jnp.asarray(count, jnp.float32)
+            evaluated[name] = evaluated.get(name, 0) + jnp.asarray(count, jnp.float32)
     image = _compose(levels, active.map, target, shape, plan)
     done("blur", image)
-    return Estimate(mean=Layers(**{LAYER: image}), diagnostics=diagnostics)
+    return image, evaluated
 
 
 def _compose(levels, mapped, target, shape, plan):

@@ -52,7 +52,8 @@ def exact_pairs(
     """A1 for flat pixel indices: every pair with its own shadow ray and `num_steps` steps of extinction; Lambert only."""
     common = CommonStages(scene, camera)
     caster, transmittance = common.caster, transmittance_of(scene.medium, common.medium_casters, num_steps=num_steps)
-    lit, _, _ = frame.light_surfels(scene, camera, plan, common, seed=seed)
+    cloud, _ = frame.make_surfels(scene, camera, plan)
+    lit, _ = frame.light_surfels(scene, cloud, plan, common, seed=seed)
     active = map_rays(scene, camera, plan, common, seed=seed, pixels=pixels)
     place = {int(p): i for i, p in enumerate(active.pixel[: active.num_rays])}
     out = np.zeros((len(pixels), 3), np.float32)
@@ -109,7 +110,8 @@ def _next_event(scene, hit, looking, u1, u2, u3):
     value = materials.evaluate(surface, hit.normal, -light.direction, -looking)
     cosine = jnp.abs(sampling.dot(hit.normal, light.direction))
     radiance = value * light.radiance * (cosine / jnp.maximum(light.pdf, 1e-30))[..., None]
-    origin = ray_casting.offset_origin(hit.position, hit.normal, light.direction)
+    scale = ray_casting.scene_scale(scene.mesh)
+    origin = ray_casting.offset_origin(hit.position, hit.normal, light.direction, scale=scale)
     return light, jnp.where((hit.valid & (light.pdf > 0))[..., None], radiance, 0.0), origin
 
 

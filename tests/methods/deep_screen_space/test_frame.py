@@ -136,6 +136,26 @@ def test_camera_inside_the_medium_and_lamp_at_a_surface(cloud_scene, camera):
         assert np.isfinite(found).all() and found.max() > 0
 
 
+def test_surfels_inside_the_medium(cloud_scene, camera):
+    """A board in the thick of the medium: finite, without spikes (splitting surfels and the bound A/delta: `test_kernel`)."""
+    board = make_mesh([([-0.3, -0.1, 0.3], [0.6, 0, 0], [0, 0, -0.6])], [[0.7, 0.7, 0.7]])
+    found = image(eqx.tree_at(lambda s: s.mesh, cloud_scene, board), camera)
+    assert np.isfinite(found).all() and found.min() >= 0
+    assert 0 < found.max() < 100 * found.mean()
+
+
+def test_a_second_bounce_is_a_layer_of_its_own_and_never_claimed(cloud_scene, camera):
+    alone, both = render(cloud_scene, camera).mean, render(cloud_scene, camera, second_bounce=8).mean
+    assert alone.volume_from_multiple is None
+    np.testing.assert_array_equal(both.volume_from_surface, alone.volume_from_surface)
+    again = np.asarray(both.volume_from_multiple)
+    assert np.isfinite(again).all() and again.min() >= 0
+    assert 0.02 < again.sum() / both.volume_from_surface.sum() < 0.7  # albedos of .1 to .7, an open room
+    (claim,) = method.claims(cloud_scene)
+    assert "volume_from_multiple" not in claim.layers
+    assert any("partial" in line for line in method.plan(cloud_scene, camera, second_bounce=8).skipped)
+
+
 def test_exact_pairs_tell_the_transport_table_apart(cloud_scene, camera):
     """A1: without transport both are the same sum; with it the table is within 4 %, without it far off."""
     options = ALL_PAIRS | {"cluster_size": 16, "table_resolution": 16}
@@ -215,7 +235,8 @@ def test_paper_mode_runs_and_is_far_off(cloud_scene, camera):
 
 def test_first_radius_unit_is_the_mean_lit_radiance(cloud_scene, camera):
     plan = method.plan(cloud_scene, camera, **SMALL)
-    lit, glossy, lost = frame.light_surfels(cloud_scene, camera, plan, CommonStages(cloud_scene, camera), seed=0)
+    cloud, lost = frame.make_surfels(cloud_scene, camera, plan)
+    lit, glossy = frame.light_surfels(cloud_scene, cloud, plan, CommonStages(cloud_scene, camera), seed=0)
     area, brightest = np.asarray(lit.area), np.asarray(lit.radiance).max(axis=1)
     np.testing.assert_allclose(frame.mean_radiance(lit), (area * brightest).sum() / area.sum(), rtol=1e-5)
     assert glossy is None and lost == 0

@@ -1,5 +1,6 @@
 """The pair kernel against float64 formulas and quadrature over the disk."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -84,6 +85,24 @@ def test_extreme_mean_cosines_stay_finite(g):
     found = evaluate(row([0, 0, -1.0], [0, 0, -1.0], 1e-3), [0, 0, -1.0], [1.0 + 1e-6, 1.5, 9.0], "henyey_greenstein", g)
     found = np.concatenate([found, evaluate(row([0, 0, -5.0], [0, 0, 1], 1e-3), [0, 0, -1.0], [1.0], "henyey_greenstein", g)])
     assert np.isfinite(found).all() and (found >= 0).all()
+
+
+@pytest.mark.parametrize(("phase", "g"), [("isotropic", 0.0), ("henyey_greenstein", 0.7), ("henyey_greenstein", 1.0)])
+def test_gradients_are_finite_where_square_roots_begin(phase, g):
+    """By the sample's distance, the surfel's place and g: at the surfel, in its plane, behind it; elsewhere a difference."""
+
+    def value(d, place, g):
+        surfel = row([0, 0, 0], [0, 0, 1], 0.02) | {name: place[i] * jnp.ones((1, 1)) for i, name in enumerate("xyz")}
+        ray = tuple(jnp.full((1, 1), x, jnp.float32) for x in (0.0, 0.0, -1.0))
+        return kernel.pair_samples(ray, [d * jnp.ones((1, 1))], surfel, phase=phase, g=g)[0][0, 0]
+
+    for place in ([0.0, 0.0, -1.0], [0.2, 0.0, -1.0], [0.1, 0.2, -0.3]):
+        found = jax.grad(value, argnums=(0, 1, 2))(jnp.float32(1.0), jnp.float32(place), jnp.float32(g))
+        assert all(bool(jnp.isfinite(x).all()) for x in found)
+    place, h = jnp.float32([0.3, 0.1, -1.5]), 4e-3
+    slope = jax.grad(value)(jnp.float32(0.6), place, jnp.float32(g))
+    above, below = (value(jnp.float32(0.6 + s * h), place, jnp.float32(g)) for s in (1, -1))
+    np.testing.assert_allclose(slope, (above - below) / (2 * h), rtol=5e-3)
 
 
 def test_shells_partition_all_distances():
