@@ -57,8 +57,8 @@ def main():
     arguments = parser.parse_args()
     scenes = [plume(24, time=STEP * k) for k in range(arguments.frames)]
     camera = square_camera(arguments.size)
-    plan = ims.plan(scenes[0], camera, num_paths=arguments.paths, num_levels=1, jitter=False)
-    many = ims.plan(scenes[0], camera, num_paths=16 * arguments.paths, num_levels=1, jitter=False)
+    plan = ims.plan(scenes[0], camera, num_paths=arguments.paths, max_lights=None, num_levels=1, jitter=False)
+    many = ims.plan(scenes[0], camera, num_paths=16 * arguments.paths, max_lights=None, num_levels=1, jitter=False)
     converged, _ = animate("same numbers", scenes, camera, many, share=0)
     change = np.abs(np.diff(converged, axis=0)).mean()
     rows, kept = [], []

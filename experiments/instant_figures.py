@@ -25,8 +25,8 @@ from instant_common import (
 )
 
 from jaxvol import camera as pinhole
+from jaxvol import direct, layers
 from jaxvol import image as metrics
-from jaxvol import layers
 from jaxvol.methods import instant_multiple_scattering as ims
 from jaxvol.methods import path_tracing
 from jaxvol.methods.instant_multiple_scattering import rendering
@@ -46,13 +46,16 @@ def reference_of(scene, camera, samples):
     return picture, np.asarray(layers.total(found.mean)), variance
 
 
-def timed(scene, camera, *, seed=3, **options):
-    """Picture, CPU seconds (second call) and counts."""
+def timed(scene, camera, *, seed=3, sets=1, **options):
+    """Mean picture of some sets of lights, CPU seconds of one (the first call not counted) and its counts."""
     plan = ims.plan(scene, camera, **options)
-    rendering.render_set(scene, camera, plan, seed=seed)
+    sizes = {}
+    rendering.render_set(scene, camera, plan, seed=seed, sizes=sizes)
     start = time.process_time()
-    images, counts = rendering.render_set(scene, camera, plan, seed=seed)
-    return total(images).reshape(camera.height, camera.width, 3), time.process_time() - start, counts
+    found = [rendering.render_set(scene, camera, plan, seed=seed + k, sizes=sizes) for k in range(sets)]
+    seconds = (time.process_time() - start) / sets
+    picture = sum(total(images) for images, _ in found) / sets
+    return picture.reshape(camera.height, camera.width, 3), seconds, found[0][1]
 
 
 def fig1(size, samples):
@@ -63,7 +66,8 @@ def fig1(size, samples):
         "clamped": {"num_levels": 0},
         "clamped + compensation": {"num_levels": 3},
     }
-    found = {name: timed(scene, camera, num_paths=512, **options) for name, options in modes.items()}
+    settings = {"num_paths": 32768, "max_lights": 4096}
+    found = {name: timed(scene, camera, **settings, **options) for name, options in modes.items()}
     loss = np.maximum(found["clamped + compensation"][0] - found["clamped"][0], 0)
     shown = [everything, reference, *(found[name][0] for name in modes), loss]
     titles = ["path tracer, all layers", "path tracer, multiple scattering", *modes, "energy loss of clamping"]
@@ -128,7 +132,7 @@ def fig5(size, samples):
     scene, camera = leak_scene(), square_camera(size)
     reference, _, variance = reference_of(scene, camera, samples)
     modes = {"rays": {}, "maps": {"visibility": "maps", "shadows": "maps"}, "none": {"visibility": "none"}}
-    settings = {"num_paths": 16384, "max_lights": 1024}  # many paths: few of them reach the dark side
+    settings = {"num_paths": 65536, "max_lights": 4096, "sets": 8}  # many paths: few of them reach the dark side
     found = {name: timed(scene, camera, **settings, **options) for name, options in modes.items()}
     dark = np.zeros((size, size), bool)
     dark[size // 4 : 3 * size // 4, size // 2 + 1 : size // 2 + max(2, size // 6)] = True
@@ -156,8 +160,8 @@ def fig6(size, samples):
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     medium = Medium(
         bounds=jnp.asarray(np.stack([low - 1, high + [1, 1, 20]]), jnp.float32),
-        sigma_s=floats(0.02, 0.02, 0.02),
-        sigma_a=floats(0.001, 0.001, 0.001),
+        sigma_s=floats(0.008, 0.008, 0.008),
+        sigma_a=floats(0.0004, 0.0004, 0.0004),
         g=jnp.float32(0.3),
     )
     lamps = PointLights(position=floats([-40, 0, 12], [0, 0, 12], [40, 0, 12]), intensity=floats(*[[300.0] * 3] * 3))
@@ -169,15 +173,18 @@ def fig6(size, samples):
         width=size,
     )
     rows, shown = [], []
-    settings = {"num_paths": 6000, "max_lights": 1200, "num_levels": 1, "num_direct": 8, "num_chains": 4, "group_size": 8}
+    once = np.asarray(layers.total(direct.render(scene, camera, direct.plan(scene, camera)).mean))
+    # A mean free path is as long as the street: clamped at a tenth of it, little is left to compensate, and little noise.
+    settings = {"num_paths": 6000, "max_lights": 1300, "mean_free_paths": 0.1, "num_levels": 1, "group_size": 8}
     for name, options in {"full resolution": {}, "1/64 of the pixels": {"upsample": 8, "jitter": False}}.items():
         picture, seconds, counts = timed(scene, camera, **settings, **options)
         evaluated = counts.get("num_evaluated", camera.height * camera.width)
         rows.append([name, counts["num_lights"], seconds, evaluated, evaluated / (camera.height * camera.width)])
-        shown.append(picture)
+        shown += [picture, picture + once]
     write_csv(out_folder() / "fig6.csv", ["mode", "num_lights", "cpu_s_per_frame", "evaluated", "share"], rows)
-    scale = 0.7 / np.percentile(shown[0], 97)
-    pictures(out_folder() / "fig6.png", shown, columns=2, scale=scale, titles=[r[0] for r in rows])
+    scale = 0.7 / np.percentile(shown[1], 95)
+    titles = [name for r in rows for name in (f"{r[0]}: virtual lights", "and light scattered once")]
+    pictures(out_folder() / "fig6.png", shown, columns=2, scale=scale, titles=titles)
     return rows
 
 
@@ -194,7 +201,7 @@ def fig7(size, samples):
             label = f"{name}, chosen of 16,384 paths"
             rows.append([label, counts["num_lights"], seconds, error, metrics.bias(picture, reference), noise])
         for number in (64, 256, 1024, 4096):
-            picture, seconds, counts = timed(scene, camera, num_paths=number)
+            picture, seconds, counts = timed(scene, camera, num_paths=number, max_lights=None)
             error = metrics.relmse(picture, reference, variance=variance)
             rows.append([name, counts["num_lights"], seconds, error, metrics.bias(picture, reference), noise])
             difference = 2 * (picture - reference)

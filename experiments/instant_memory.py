@@ -21,7 +21,7 @@ def main():
     arguments = parser.parse_args()
     scene = cube()
     camera = dataclasses.replace(square_camera(8), height=arguments.height, width=arguments.width)
-    plan = ims.plan(scene, camera, num_paths=2560, upsample=arguments.upsample)
+    plan = ims.plan(scene, camera, num_paths=2560, max_lights=None, upsample=arguments.upsample)
     start = time.process_time()
     estimate = ims.render(scene, camera, plan)
     seconds = time.process_time() - start

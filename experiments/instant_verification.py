@@ -26,8 +26,8 @@ SETTINGS = {
     "cube": {"num_paths": 65536, "max_lights": 4096, "num_direct": 8},
     "cube_g": {"num_paths": 65536, "max_lights": 8192, "num_direct": 32},
     "plume": {"num_paths": 32768, "max_lights": 8192, "num_direct": 8, "group_size": 40},
-    "room": {"num_paths": 16384, "num_direct": 8, "group_size": 100, "light_stride": 16},
-    "corner": {"num_paths": 65536, "num_direct": 8, "group_size": 100, "light_stride": 16},
+    "room": {"num_paths": 16384, "max_lights": None, "num_direct": 8, "group_size": 100, "light_stride": 16},
+    "corner": {"num_paths": 65536, "max_lights": None, "num_direct": 8, "group_size": 100, "light_stride": 16},
 }
 SIZE = 24
 SAMPLES = {"cube": 512, "cube_g": 512, "plume": 512, "room": 1024, "corner": 1024}  # of one run of the reference
