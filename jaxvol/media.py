@@ -152,13 +152,13 @@ def density_packed(
 
 
 def majorants(grid: ArrayLike, *, block: int = 4) -> Majorants:
-    """Coarse upper bounds of the trilinear interpolant: the maximum over `block`^3 voxels and one voxel around; eager."""
+    """Upper bounds of the trilinear interpolant: the maximum over the corners of `block`^3 cubes of voxel centres; eager."""
     grid = np.asarray(grid, np.float32)
-    shape = [-(-n // block) for n in grid.shape]
-    padded = np.pad(grid, [(1, s * block - n + 1) for n, s in zip(grid.shape, shape, strict=True)], mode="edge")
+    shape = [n // block + 1 for n in grid.shape]
+    padded = np.pad(grid, [(1, s * block - n) for n, s in zip(grid.shape, shape, strict=True)], mode="edge")
     coarse = padded
     for axis, count in enumerate(shape):
-        windows = [np.take(coarse, np.arange(count) * block + k, axis=axis) for k in range(block + 2)]
+        windows = [np.take(coarse, np.arange(count) * block + k, axis=axis) for k in range(block + 1)]
         coarse = np.maximum.reduce(windows)
     return Majorants(density=jnp.asarray(coarse), block=block)
 
@@ -174,7 +174,11 @@ def majorant_block(grid: ArrayLike, *, sigma_t: float, voxel_size: float) -> int
         mean = float(np.mean(np.asarray(majorants(grid, block=block).density)))
         return sigma_t * mean + 1.5 / (block * voxel_size)
 
-    return min((4, 8, 16), key=steps)
+    found = min((4, 8, 16), key=steps)
+    # Small cells are looked at only where even bounds without any slack would pay: grids are large.
+    least = sigma_t * float(np.mean(np.asarray(grid)))
+    tried = [block for block in (1, 2) if least + 1.5 / (block * voxel_size) < steps(found)]
+    return min((*tried, found), key=steps)
 
 
 def majorant_cell(
@@ -182,9 +186,10 @@ def majorant_cell(
 ) -> tuple[Int[Array, "*b"], Float[Array, "*b 3"], Float[Array, "*b 3"]]:
     """Flat index, lower and upper corner (world) of the coarse cell that holds each point (clamped to the grid)."""
     coarse = medium.majorants
-    size = voxel_size(medium) * coarse.block
+    voxel = voxel_size(medium)
+    size, first = voxel * coarse.block, medium.bounds[0] - 0.5 * voxel
     last = jnp.asarray(coarse.density.shape, jnp.int32) - 1
-    cell = jnp.clip(jnp.floor((points - medium.bounds[0]) / size).astype(jnp.int32), 0, last)
+    cell = jnp.clip(jnp.floor((points - first) / size).astype(jnp.int32), 0, last)
     flat = (cell[..., 0] * coarse.density.shape[1] + cell[..., 1]) * coarse.density.shape[2] + cell[..., 2]
-    lower = medium.bounds[0] + cell * size
+    lower = first + cell * size
     return flat, lower, lower + size

@@ -63,7 +63,8 @@ class PhaseTable(eqx.Module):
 class Majorants(eqx.Module):
     """Maximum density of each coarse cell, of the trilinear interpolant and so a true bound.
 
-    A cell covers `block` voxels along each axis, counted from the lower bounds; the last one may stick out.
+    A cell covers `block` of the cubes between voxel centres along each axis, from half a voxel below the lower bounds
+    on; the last one may stick out.
     """
 
     density: Float[Array, "Xc Yc Zc"]

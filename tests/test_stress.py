@@ -40,7 +40,7 @@ def test_a_class_is_one_structure():
     """Floats differ, shapes do not: hundreds of scenes share a few compilations."""
     for name in scenes.CLASSES:
         forms = {jax.tree.structure(make_scene(scenes.draw(name, np.random.default_rng(seed))).scene) for seed in range(4)}
-        assert len(forms) <= 2, name  # majorant grids may have two sizes
+        assert len(forms) <= 3, name  # majorant grids may have three sizes
 
 
 def test_turning_four_times_is_no_turn():
