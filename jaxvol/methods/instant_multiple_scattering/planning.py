@@ -87,8 +87,8 @@ def plan(
     scene: Scene,
     camera: Camera,
     *,
-    num_paths: int = 1024,
-    max_lights: int | None = None,
+    num_paths: int = 4096,
+    max_lights: int | None = 1024,
     num_sets: int = 1,
     max_depth: int = 256,
     lights: str = "points",
@@ -122,7 +122,7 @@ def plan(
     """Decide how to render a scene; eager.
 
     num_paths: light paths of a set; max_lights: about so many of their lights are gathered, those that the picture sees most
-    (unbiased; ten thousand paths cost little, ten thousand lights do not; None: all); num_sets: independent sets that are
+    (unbiased; thousands of paths cost little, thousands of lights do not; None: all); num_sets: independent sets that are
     averaged (two or more give a variance).
     lights: virtual "points", or "rays": whole flights, neither clamped nor compensated (homogeneous, no surfaces).
     mean_free_paths: clamp distance d = mean_free_paths / local sigma_t, at most a tenth of the scene (None: unclamped).
@@ -198,7 +198,7 @@ def plan(
         transmittance=transmittance,
         visibility=visibility,
         shadows=shadows if scene.mesh is not None else "rays",
-        columns=_columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsample),
+        columns=_columns_by(columns, tracked, camera, _most_lights(num_paths, max_lights), group_size, map_size, upsample),
         map_size=map_size,
         map_steps=map_steps,
         direct_at_vertex=direct_at_vertex,
@@ -250,7 +250,12 @@ def _eye_steps(medium):
     return int(np.clip(8 * -(-max(medium.density.shape) // 8), 32, 256))
 
 
-def _columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsample):
+def _most_lights(num_paths, max_lights):
+    """About as many lights as will be gathered: few paths have more than four."""
+    return 4 * num_paths if max_lights is None else min(4 * num_paths, max_lights)
+
+
+def _columns_by(columns, tracked, camera, num_lights, group_size, map_size, upsample):
     """How columns towards lights are found: maps where a light has several times more receivers than texels.
 
     A map costs its texels, a march one in `group_size` of the receivers, both with as many lookups; reading a map costs
@@ -261,7 +266,7 @@ def _columns_by(columns, tracked, camera, num_paths, group_size, map_size, upsam
     if columns != "auto":
         return columns
     receivers = 1.75 * camera.height * camera.width / (upsample * upsample * group_size)
-    fits = 4 * num_paths * map_size * map_size * 16 * 4 < _MAP_BYTES
+    fits = num_lights * map_size * map_size * 16 * 4 < _MAP_BYTES
     return "maps" if fits and receivers > 1.5 * map_size * map_size else "march"
 
 
