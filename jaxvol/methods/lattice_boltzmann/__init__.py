@@ -23,7 +23,7 @@ from jaxvol import extinction, ray_casting, segments
 from jaxvol.layers import from_items
 from jaxvol.methods.lattice_boltzmann.illumination import Illumination, illuminate
 from jaxvol.methods.lattice_boltzmann.materials import cropped
-from jaxvol.methods.lattice_boltzmann.planning import Plan, claims, plan
+from jaxvol.methods.lattice_boltzmann.planning import Plan, claims, plan, surfaces_are_lit
 from jaxvol.methods.lattice_boltzmann.refraction import radiance_bent
 from jaxvol.methods.lattice_boltzmann.view import Source, emission_table, gather_straight
 from jaxvol.types import Camera, Estimate, Layers, Rays, Scene
@@ -38,7 +38,7 @@ def radiance(scene: Scene, rays: Rays, plan: Plan, light: Illumination, *, seed:
     origin, direction, t_max = (np.array(x, np.float32) for x in (rays.origin, rays.direction, rays.t_max))
     names, sources = _sources(plan, light)
     grid = light.materials.grid
-    table, layout = emission_table(grid, *sources)
+    table, layout = emission_table(grid, *sources, unit=light.unit)
     if plan.refract:
         volume, rest = radiance_bent(scene, plan, light.materials, table, layout, origin, direction, t_max, seed=seed)
     else:
@@ -49,7 +49,7 @@ def radiance(scene: Scene, rays: Rays, plan: Plan, light: Illumination, *, seed:
             layout, origin, direction, t_max, step=plan.view_step, degree=plan.degree,
         )  # fmt: skip
         rest = {}
-    return {name: volume[:, k] * light.spectrum for k, name in enumerate(names)} | rest
+    return {name: volume[:, k] * (light.unit * light.spectrum) for k, name in enumerate(names)} | rest
 
 
 def _sources(plan, light):
@@ -82,24 +82,26 @@ def render(scene: Scene, camera: Camera, plan: Plan, *, seed: int = 0, on_stage=
         side -= 1
     rows, columns = side, plan.samples_per_pixel // side
     offsets = [((i + 0.5) / columns - 0.5, (j + 0.5) / rows - 0.5) for j in range(rows) for i in range(columns)]
+    offsets = np.array(offsets, np.float32)[:, None]
     centers = np.asarray(cameras.pixel_centers(camera))
     sums: dict[str, np.ndarray] = {}
-    for shift in offsets:
-        for first in range(0, len(centers), _ROWS):
-            part = slice(first, first + _ROWS)
-            rays = cameras.generate_rays(camera, jnp.asarray(centers[part] + np.array(shift, np.float32)))
-            for name, value in radiance(scene, rays, plan, light, seed=seed).items():
-                sums.setdefault(name, np.zeros((len(centers), 3), np.float32))[part] += value / len(offsets)
+    num_pixels = max(_ROWS // len(offsets), 1)
+    for first in range(0, len(centers), num_pixels):
+        part = slice(first, first + num_pixels)
+        rays = cameras.generate_rays(camera, jnp.asarray((centers[part] + offsets).reshape(-1, 2)))
+        for name, value in radiance(scene, rays, plan, light, seed=seed).items():
+            pixels = sums.setdefault(name, np.zeros((len(centers), 3), np.float32))
+            pixels[part] = value.reshape(len(offsets), -1, 3).mean(0)
     if on_stage is not None:
         on_stage("view")
     images = {name: jnp.asarray(value.reshape(camera.height, camera.width, 3)) for name, value in sums.items()}
     mean = from_items(images)
-    if scene.mesh is None:
+    if not surfaces_are_lit(scene):
         mean = _without_surfaces(mean)
     return Estimate(mean=mean, diagnostics=light.diagnostics)
 
 
 def _without_surfaces(layers: Layers) -> Layers:
-    """Light from surfaces is exactly zero where there are none."""
+    """Light from surfaces is exactly zero where none are lit."""
     some = next(iter([x for x in (layers.volume_from_light, *layers.sums.values()) if x is not None]))
     return eqx.tree_at(lambda x: x.volume_from_surface, layers, jnp.zeros_like(some), is_leaf=lambda x: x is None)

@@ -36,6 +36,7 @@ class Illumination(NamedTuple):
     from_surface: Float[Array, "C X Y Z"] | None
     from_volume: Float[Array, "C X Y Z"]  # scattered once, straight from the lights before
     scattered: Float[Array, "C X Y Z"]  # scattered at all, in the medium
+    unit: float  # W: a power of two near what the lights send; numbers over it neither overflow nor vanish when squared
     diagnostics: dict[str, Array]
     unscattered: Unscattered | None = None  # of from_light; None when scattering is isotropic
     surface_unscattered: Unscattered | None = None  # of from_surface
@@ -57,16 +58,20 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     rays = light_rays.from_lights(scene, low, high, float(grid.voxel), rays_per_voxel=plan.rays_per_voxel, seed=seed)
     if plan.refract:
         rays = enter_body(scene, rays)
-    power, spectrum = _channels(rays.power, plan.num_channels)
-    marched = march(materials, plan, rays, power, seed)
-    track, books = marched.track, [marched]
-    from_surface = None
+    bounced = None
     if plan.num_surface_rays:
         bounced = light_rays.reflected(scene, low, high, count=plan.num_surface_rays, seed=seed)
         if plan.refract:
             bounced = enter_body(scene, bounced)
-        surface_power = bounced.power if plan.num_channels == 3 else (bounced.power @ spectrum / (spectrum @ spectrum))[:, None]
-        second = march(materials, plan, bounced, surface_power, seed)
+    unit = _unit(rays.power if bounced is None else np.concatenate([rays.power, bounced.power]))
+    power, spectrum = _channels(rays.power / unit, plan.num_channels)
+    marched = march(materials, plan, rays, power, seed)
+    track, books = marched.track, [marched]
+    from_surface = None
+    if bounced is not None:
+        power = bounced.power / unit
+        power = power if plan.num_channels == 3 else (power @ spectrum / (spectrum @ spectrum))[:, None]
+        second = march(materials, plan, bounced, power, seed)
         from_surface = second.track
         books.append(second)
     report("march")
@@ -97,15 +102,25 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
         "num_applications": applications,
         "residual": residual,
         "converged": jnp.all(converged),
-        "sent": jnp.asarray(sum(b.sent for b in books), jnp.float32),
-        "escaped_unscattered": jnp.asarray(sum(b.escaped for b in books), jnp.float32),
-        "live": jnp.asarray(sum(b.live for b in books), jnp.float32),
+        "sent": jnp.asarray(unit * sum(b.sent for b in books), jnp.float32),
+        "escaped_unscattered": jnp.asarray(unit * sum(b.escaped for b in books), jnp.float32),
+        "live": jnp.asarray(unit * sum(b.live for b in books), jnp.float32),
         "num_ray_steps": jnp.asarray(sum(b.num_steps for b in books), jnp.float32),
     }
+    track, from_surface, from_volume, scattered, flux = (
+        None if x is None else unit * x for x in (track, from_surface, from_volume, scattered, flux)
+    )
+    forward = [None if b.unscattered is None else b.unscattered._replace(track=unit * b.unscattered.track) for b in books]
     return Illumination(
-        materials, spectrum, track, from_surface, from_volume, scattered, diagnostics,
-        *[b.unscattered for b in books], *[None] * (2 - len(books)), flux,
+        materials, spectrum, track, from_surface, from_volume, scattered, unit, diagnostics, *forward,
+        *[None] * (2 - len(books)), flux,
     )  # fmt: skip
+
+
+def _unit(power):
+    """A power of two about the sum of all rays; 1 in the dark."""
+    total = float(power.max(axis=1, initial=0.0).sum(dtype=np.float64))
+    return 2.0 ** round(np.log2(total)) if total > 0 else 1.0
 
 
 def _walls(materials, plan):

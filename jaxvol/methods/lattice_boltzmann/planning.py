@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jaxvol import media
+from jaxvol import lights, media
 from jaxvol.layers import Claim
 from jaxvol.methods.lattice_boltzmann import fresnel
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES
@@ -83,6 +83,12 @@ def claims(scene: Scene) -> tuple[Claim, ...]:
         found.append(Claim(("emission",), "reflection inside the medium is missed"))
         found.append(Claim(("surface_from_light",), _SKY))
     return tuple(found)
+
+
+def surfaces_are_lit(scene: Scene) -> bool:
+    """Whether there are lights, and surfaces that reflect any of their light."""
+    reflects = scene.mesh is not None and float(np.max(np.asarray(scene.mesh.albedo))) > 0
+    return reflects and lights.num_lights(scene) > 0
 
 
 def _refracts(scene):
@@ -204,7 +210,7 @@ def plan(
         march_step=march_step,
         view_step=view_step,
         rays_per_voxel=rays_per_voxel,
-        num_surface_rays=surface_rays if scene.mesh is not None and np.max(np.asarray(scene.mesh.albedo)) > 0 else 0,
+        num_surface_rays=surface_rays if surfaces_are_lit(scene) else 0,
         samples_per_pixel=samples_per_pixel,
         tolerance=tolerance,
         max_applications=max_applications,
@@ -270,9 +276,9 @@ def _thickest(scene, extinction):
 def _one_spectrum(scene) -> bool:
     """Whether all lights that can reach the medium have the same colour and surfaces do not change it."""
     colours = []
-    for lights, name in (("point_lights", "intensity"), ("spot_lights", "intensity"), ("directional_lights", "irradiance")):
-        if getattr(scene, lights) is not None:
-            colours.append(np.asarray(getattr(getattr(scene, lights), name)))
+    for kind, name in (("point_lights", "intensity"), ("spot_lights", "intensity"), ("directional_lights", "irradiance")):
+        if getattr(scene, kind) is not None:
+            colours.append(np.asarray(getattr(getattr(scene, kind), name)))
     if scene.environment is not None:
         colours.append(np.asarray(scene.environment.radiance).reshape(-1, 3))
     if scene.mesh is not None:
@@ -282,7 +288,7 @@ def _one_spectrum(scene) -> bool:
             return False
     if not colours:
         return True
-    colours = np.concatenate(colours)
+    colours = np.concatenate(colours).astype(np.float64)
     total = colours.sum(0)
     size = colours.sum(1, keepdims=True)
-    return bool(np.all(np.abs(colours - size * total / max(total.sum(), 1e-30)) <= 1e-5 * max(float(size.max()), 1e-30)))
+    return bool(np.all(np.abs(colours - size * total / max(total.sum(), 1e-300)) <= 1e-5 * max(float(size.max()), 1e-300)))

@@ -51,9 +51,9 @@ class Source(NamedTuple):
     direction: Float[Array, "3 X Y Z"] | None = None  # its mean direction, shorter than 1 where directions differ
 
 
-def emission_table(grid: Grid, *sources: Source) -> tuple[Float[Array, "voxels F"], Layout]:
-    """Fluence [W/m2] of each layer and channel, moments and marched light where there are any, side by side for one gather."""
-    scale = 1.0 / (grid.voxel * grid.voxel)
+def emission_table(grid: Grid, *sources: Source, unit: float = 1.0) -> tuple[Float[Array, "voxels F"], Layout]:
+    """Fluence [`unit` W/m2] of each layer and channel, moments and marched light if any, side by side for one gather."""
+    scale = 1.0 / (grid.voxel * grid.voxel * unit)
     flux, first = (any(getattr(s, name) is not None for s in sources) for name in ("flux", "track"))
     some = next(x for s in sources for x in (s.fluence, s.track) if x is not None)
     dark = jnp.zeros_like(some)
