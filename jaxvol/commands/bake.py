@@ -62,7 +62,8 @@ def bake(
         typer.Option(help="Mean free paths across the medium, below which all is marched; 0 = never. Default: 10.", min=0),
     ] = None,
     legs: Annotated[
-        int | None, typer.Option(help="Scatter points of a marched segment before the tables. Default: 8 or 1.", min=1)
+        int | None,
+        typer.Option(help="Scatter points of a marched segment before the tables. Default: 2 to 8 if bounded, else 1.", min=1),
     ] = None,
     similarity: Annotated[bool, typer.Option(help="Multiple scattering by similarity to an isotropic medium.")] = False,
     g_range: Annotated[float | None, typer.Option(help="Single scattering interpolated between three values of g.")] = None,

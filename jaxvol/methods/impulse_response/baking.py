@@ -7,7 +7,8 @@ import numpy as np
 
 from jaxvol.jobs import Parts, Stop
 from jaxvol.layers import SURFACE
-from jaxvol.methods.impulse_response import estimate, gather
+from jaxvol.methods.impulse_response import estimate
+from jaxvol.methods.impulse_response.kit import Kit
 from jaxvol.methods.impulse_response.planning import Plan
 
 _PART = 4096  # receivers at a time
@@ -27,7 +28,7 @@ class Interrupted(Exception):
 
 
 def bake(
-    kit: gather.Kit,
+    kit: Kit,
     plan: Plan,
     points: np.ndarray,
     normals: np.ndarray,

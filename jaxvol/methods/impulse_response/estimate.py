@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike
 from jaxvol import zonal_lookup
 from jaxvol.layers import SURFACE, from_items
 from jaxvol.methods.impulse_response import gather, planning, receivers
+from jaxvol.methods.impulse_response.kit import Kit, Tally
 from jaxvol.methods.impulse_response.planning import Plan
 from jaxvol.methods.impulse_response.receivers import HARMONICS
 from jaxvol.types import Estimate, Scene
@@ -16,7 +17,7 @@ from jaxvol.types import Estimate, Scene
 Progress = Callable[[float], None]
 
 
-def needs_paths(kit: gather.Kit) -> bool:
+def needs_paths(kit: Kit) -> bool:
     """Whether anything beside delta lights' own light arrives."""
     return kit.max_bounces > 0 or kit.scene.area_lights is not None or kit.scene.environment is not None or kit.marches
 
@@ -64,7 +65,7 @@ def irradiance(
 
 
 def bake(
-    kit: gather.Kit,
+    kit: Kit,
     points: np.ndarray,
     normals: np.ndarray,
     plan: Plan,
@@ -78,7 +79,7 @@ def bake(
     the SH of incident radiance [*batch, 9, 3]."""
     shape = points.shape[:-1]
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
-    tally = gather.Tally()
+    tally = Tally()
     rows = (1 + HARMONICS, 3) if plan.harmonics else (3,)
     fixed = {name: np.zeros((points.shape[0], *rows)) for name in (*SURFACE, "occluded")}
     mean = {name: np.zeros((points.shape[0], *rows)) for name in (*SURFACE, "occluded")}

@@ -1,75 +1,27 @@
 """Stage 3, gathering: light from every emitter at receivers, and along surface paths; rays are cast between jitted steps.
 
 Segments that end at the receivers themselves and are cut by an occluder, or lie in a medium of much contrast, are integrated by
-`marched` (random, counted in `marched`); with `occlusion = "drop"` the scattered light of occluded emitters is dropped and
+`walks` (random, counted in `marched`); with `occlusion = "drop"` the scattered light of occluded emitters is dropped and
 counted (section 5.2, the paper's rule), as it is at all further vertices.
 """
 
-from collections.abc import Callable
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike
 
-from jaxvol import extinction, ray_casting, sampling
-from jaxvol.methods.impulse_response import emitters, light_sources, marched, surface_paths
+from jaxvol import ray_casting, sampling
+from jaxvol.methods.impulse_response import emitters, light_sources, surface_paths, walks
+from jaxvol.methods.impulse_response.kit import Kit, Tally, occluded, thickness
 from jaxvol.methods.impulse_response.light_sources import DELTA, Light, delta_lights
-from jaxvol.methods.impulse_response.lookup import Responses
 from jaxvol.methods.impulse_response.receivers import Irradiance, Receiver, first_row, like
-from jaxvol.types import Medium, Scene
+from jaxvol.methods.impulse_response.walks import Draw
 
 _STREAM = sampling.stream("impulse_response.lights")
 _PICK = sampling.stream("impulse_response.light_lookups")
 _MARCHED = sampling.stream("impulse_response.marched")
-# Segments of the receivers themselves and those marched; lookups and those past the tables' tau; all segments of live paths.
-COUNTS = ("segments", "marched", "lookups", "beyond", "traced")
-
-
-Draw = Callable[[int], tuple[Array, Array, Array, Array]]
-
-
-class Kit(eqx.Module):
-    """Everything that a bake prepares once."""
-
-    scene: Scene
-    responses: Responses | None  # None: light is attenuated only
-    faces: surface_paths.Faces
-    probe_sigma: Float[Array, ""]
-    caster: ray_casting.Caster = eqx.field(static=True)
-    marching: extinction.MarchingMedium | None = None
-    medium_casters: tuple = eqx.field(static=True, default=())
-    image: bool = eqx.field(static=True, default=True)
-    num_steps: int = eqx.field(static=True, default=1)
-    max_bounces: int = eqx.field(static=True, default=8)
-    shares: tuple[float, float, float] = eqx.field(static=True, default=(1.0, 0.0, 0.0))
-    march_occluded: bool = eqx.field(static=True, default=False)
-    contrast: float | None = eqx.field(static=True, default=None)  # above it segments are marched; None = never
-    march_all: bool = eqx.field(static=True, default=False)  # the medium's bounds are near everywhere
-    legs: int = eqx.field(static=True, default=1)  # scatter points of a marched segment before the tables
-    multiple: bool = eqx.field(static=True, default=True)
-    open: bool = eqx.field(static=True, default=False)  # all faces in one plane: nothing occludes
-
-    @property
-    def tables_end(self) -> bool:
-        """Whether the receivers' own segments are all marched: nothing of them is looked up."""
-        return self.march_all and (self.march_occluded or self.open)
-
-    @property
-    def marches(self) -> bool:
-        """Whether any segment may be marched."""
-        return self.responses is not None and (self.march_occluded or self.march_all or self.contrast is not None)
-
-
-class Tally(dict):
-    """Counts of `COUNTS`, summed as they come; values stay on the device until read."""
-
-    def count(self, **values: ArrayLike) -> None:
-        """Add to some counts."""
-        for name, value in values.items():
-            self[name] = self.get(name, 0) + value
 
 
 @partial(jax.jit, static_argnames="image")
@@ -104,86 +56,6 @@ def _beyond(responses, tau, counted):
     return jnp.sum(counted & jnp.any(tau > limit, axis=-1)), jnp.sum(counted)
 
 
-def thickness(kit: Kit, origin, direction, t_max) -> Float[Array, "n 3"] | None:
-    """Optical thickness of ways, RGB; None without a medium."""
-    medium: Medium | None = kit.scene.medium
-    if medium is None:
-        return None
-    return extinction.optical_thickness(
-        medium, origin, direction, t_max, casters=kit.medium_casters, num_steps=kit.num_steps, marching=kit.marching
-    )
-
-
-def _occluded(kit, origin, direction, length):
-    if kit.open:
-        return np.zeros(origin.shape[0], bool)
-    return np.asarray(ray_casting.occluded(kit.caster, origin, direction, length))
-
-
-def by_marching(kit: Kit, position, normal, light: Light, visible: np.ndarray) -> np.ndarray:
-    """Which segments the tables do not fit: all in a bounded medium, occluded ones where asked for, those of much contrast."""
-    if kit.march_all:
-        return visible | kit.march_occluded
-    chosen = np.zeros(visible.shape, bool)
-    if kit.march_occluded:
-        chosen |= ~visible
-    if kit.contrast is not None:
-        chosen |= np.asarray(marched.contrast(kit.marching, position, normal, light)) > kit.contrast
-    return chosen
-
-
-def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light, chosen: np.ndarray, draw: Draw):
-    """(once, more often) of the chosen segments by one random walk of `kit.legs` scatter points each, zeros elsewhere.
-
-    `draw(i)` gives the i-th four random numbers of every segment.
-    """
-    rows = np.flatnonzero(chosen)
-    count, num = rows.size, chosen.shape[0]
-    if count == 0:
-        zero = jnp.zeros(jax.eval_shape(receiver.straight, light.direction, light.strength).shape, jnp.float32)
-        return zero, zero
-    lanes = max(num // 8, 1) if count <= num // 8 else num  # two sizes, so two compilations
-    rows = np.concatenate([rows, np.full(lanes - count, rows[0])])
-    take = partial(jax.tree.map, lambda x: x[rows] if jnp.shape(x)[:1] == (num,) else x)
-    part, position, index, seen = take((receiver, position, index, light))
-    medium, steps = kit.marching.regions[0], kit.num_steps
-    where = marched.place(kit.marching, position, part.normal, seen, take(draw(0)), num_steps=steps)
-    start = surface_paths.lifted(position, part.normal, kit.faces.scale)
-    reached = ~_occluded(kit, start, where.direction, where.distance)
-    weight = marched.throughput(medium, where, jnp.asarray(reached))
-    points, outward, once, more = position + where.distance[:, None] * where.direction, where.direction, None, 0.0
-    for leg in range(1, kit.legs + 1):
-        again = light_sources.see_again(kit.scene, position, kind, index, seen, points)
-        lit = jnp.asarray(~_occluded(kit, *light_sources.shadow_ray(kit.faces.scale, points, None, again)))
-        far = thickness(kit, points, again.direction, again.distance)
-        radiance = weight * marched.scattered_once(medium, outward, again, lit, far)
-        once, more = (radiance, more) if once is None else (once, more + radiance)
-        if not kit.multiple:
-            break
-        if leg == kit.legs:
-            around = marched.surroundings(medium, where, part.normal, points - position)
-            arguments = (medium, kit.responses, outward, again, lit, far, part.normal, *around)
-            more = more + weight * marched.scattered_more(*arguments, image=kit.image)
-        else:
-            outward, distance, factor = marched.onward(kit.marching, points, outward, again, take(draw(leg)), num_steps=steps)
-            open_way = ~_occluded(kit, points, outward, distance)
-            weight = weight * factor * jnp.asarray(open_way)[:, None]
-            points = points + distance[:, None] * outward
-    found = _to_receiver(part, where.direction, once, jnp.zeros_like(once) if not kit.multiple else more)
-    return tuple(_scatter(value, rows[:count], num) for value in found)
-
-
-@jax.jit
-def _to_receiver(receiver, direction, once, more):
-    return receiver.straight(direction, once), receiver.straight(direction, more)
-
-
-def _scatter(value, rows, num):
-    whole = np.zeros((num, *value.shape[1:]), np.float32)
-    whole[rows] = np.asarray(value)[: rows.size]
-    return jnp.asarray(whole)
-
-
 def light_from(
     kit: Kit,
     receiver: Receiver,
@@ -204,9 +76,9 @@ def light_from(
     the random numbers `draw`, or left out where None. `smooth` False leaves out what `draw` None gives: the two add up.
     """
     light = light_sources.see(kit.scene, position, kind, index, u)
-    visible = ~_occluded(kit, *light_sources.shadow_ray(kit.faces.scale, position, receiver.normal, light))
+    visible = ~occluded(kit, *light_sources.shadow_ray(kit.faces.scale, position, receiver.normal, light))
     by_march = own and kit.marches
-    chosen = by_marching(kit, position, receiver.normal, light, visible) if by_march else None
+    chosen = walks.by_marching(kit, position, receiver.normal, light, visible) if by_march else None
     direct = once = more = lost = None
     responses = None if own and kit.tables_end else kit.responses
     if smooth:
@@ -223,7 +95,7 @@ def light_from(
         if own and kit.responses is not None:
             tally.count(segments=visible.size, marched=0 if chosen is None else int(chosen.sum()))
     if chosen is not None and draw is not None:
-        found = march(kit, receiver, position, kind, index, light, chosen, draw)
+        found = walks.march(kit, receiver, position, kind, index, light, chosen, draw)
         if not smooth:
             return jnp.zeros_like(found[0]), *found, jnp.zeros_like(found[0])
         once, more = once + found[0], more + found[1]
@@ -300,17 +172,17 @@ def _step(kit, receiver, position, item, sample, seed, depth, tally):
     arrival = surface_paths.arrive(mesh, kit.faces, position, normal, proposal, t, face, kit.probe_sigma)
     visible = plumb = np.ones(item.shape, bool)
     if kit.shares[0] < 1:  # otherwise the ray itself is the proof
-        visible = ~_occluded(kit, *arrival.between)
-        plumb = ~_occluded(kit, *arrival.plumb)
+        visible = ~occluded(kit, *arrival.between)
+        plumb = ~occluded(kit, *arrival.plumb)
     tau = thickness(kit, position, arrival.direction, arrival.distance)
     chosen = response = None
     responses = None if depth == 1 and kit.tables_end else kit.responses
     if depth == 1 and kit.marches:
         light = Light(arrival.direction, arrival.distance, jnp.ones_like(position), arrival.normal)
         sight = visible | np.asarray(proposal.technique == 0)
-        chosen = by_marching(kit, position, normal, light, sight) & np.asarray(arrival.valid)
+        chosen = walks.by_marching(kit, position, normal, light, sight) & np.asarray(arrival.valid)
         draw = partial(_marching_numbers, seed, item, sample, 7)
-        once, more = march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, draw)
+        once, more = walks.march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, draw)
         response = once + more
         tally.count(segments=chosen.size, marched=int(chosen.sum()))
     if responses is not None:

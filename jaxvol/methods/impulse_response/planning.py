@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxvol import extinction, lights, media, ray_casting, segments, tables, zonal_lookup
 from jaxvol.layers import SURFACE, Claim
-from jaxvol.methods.impulse_response import gather, lookup, surface_paths
+from jaxvol.methods.impulse_response import lookup, surface_paths
+from jaxvol.methods.impulse_response.kit import Kit
 from jaxvol.types import Camera, Medium, Mesh, Scene
 
 Scattering = Literal["surface", "attenuated", "single", "multiple"]
@@ -16,7 +17,7 @@ Occlusion = Literal["march", "drop"]
 _MODES = ("surface", "attenuated", "single", "multiple")
 CONTRAST = 0.5  # of density along a segment, above which it is marched
 BOUNDED = 10.0  # mean free paths across the medium, below which its bounds count everywhere
-_LEGS = 8  # of marched segments in a bounded medium: scatter points before the tables' infinite medium takes over
+_MOST_LEGS = 8  # of marched segments in a bounded medium, before the tables' infinite medium takes over
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,9 @@ def plan(
             None = never, the paper's mode.
         bounded: mean free paths across the thinnest side of a medium's box, below which all segments of receivers are
             integrated inside its bounds, since the tables know an infinite medium only; None = never, the paper's mode.
-        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64; None = 8 in a bounded medium,
-            else 1. More follow light around occluders and along bounds further, at the price of noise.
+        legs: scatter points of a marched segment before the tables bring the rest, 1 to 64; None = in a bounded medium twice
+            the mean free paths across it, 2 to 8, else 1. More follow light around occluders and along bounds further, at the
+            price of noise.
         similarity: the paper's map of light scattered twice or more to an isotropic medium.
         g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
         harmonics: also bake SH of incident radiance.
@@ -159,9 +161,11 @@ def plan(
     if heterogeneous and not segments.is_box(medium):
         skipped.append("contrast is not measured in media with boundaries or inclusions: their mean serves")
         heterogeneous = False
-    march_all = scatters and bounded is not None and segments.is_box(medium) and _mean_free_paths(medium) < bounded
+    across = _mean_free_paths(medium) if scatters and segments.is_box(medium) else np.inf
+    march_all = bounded is not None and across < bounded
     if march_all:
         heterogeneous = False
+        legs = legs or int(np.clip(2 * np.ceil(across), 2, _MOST_LEGS))
     elif scatters and not heterogeneous:
         skipped.append("no density varies along segments: none is marched for its contrast")
     if not (scatters and back_scattering):
@@ -175,7 +179,7 @@ def plan(
         march_occluded=scatters and occlusion == "march" and not bare and segments.is_box(medium),
         contrast=contrast if heterogeneous else None,
         march_all=march_all,
-        legs=legs or (_LEGS if march_all else 1),
+        legs=legs or 1,
         similarity=similarity,
         g_range=g_range,
         harmonics=harmonics,
@@ -219,7 +223,7 @@ def _probe_sigma(mesh: Mesh, medium: Medium | None) -> float:
     return float(np.float32(max(density * sigma[sigma > 0].min(), 1 / extent)))
 
 
-def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTables | None = None) -> gather.Kit:
+def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTables | None = None) -> Kit:
     """Everything that baking needs, once per scene: resampled tables, ray casters, marching tables; eager.
 
     `responses_from` are the tables, the package's default set where None. Raises ValueError where no face has an area.
@@ -237,7 +241,7 @@ def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTable
             g_range=plan.g_range,
         )
     bare = Scene(**{**{name: getattr(scene, name) for name in Scene.__dataclass_fields__}, "medium": medium})
-    return gather.Kit(
+    return Kit(
         scene=bare,
         responses=responses,
         faces=surface_paths.sampled_faces(scene.mesh),

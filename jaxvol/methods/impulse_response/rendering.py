@@ -10,6 +10,7 @@ from jaxvol import camera as cameras
 from jaxvol import first_hit, materials, sampling, zonal_lookup
 from jaxvol.layers import SURFACE, from_items
 from jaxvol.methods.impulse_response import estimate, gather, planning
+from jaxvol.methods.impulse_response.kit import Kit, Tally, thickness
 from jaxvol.methods.impulse_response.planning import Plan
 from jaxvol.methods.impulse_response.receivers import Irradiance, Reflection
 from jaxvol.types import Camera, Estimate, Rays, Scene
@@ -34,7 +35,7 @@ def render(
     if samples < 1:
         raise ValueError(f"samples: {samples} is not allowed, must be >= 1")
     kit = planning.prepare(scene, plan, responses_from=tables)
-    tally = gather.Tally()
+    tally = Tally()
     total = camera.height * camera.width
     lanes = estimate.lanes_for(total, plan.num_lanes)
     mean = {name: np.zeros((total, 3)) for name in SURFACE}
@@ -91,7 +92,7 @@ def _reflect(mesh, face, valid, through, layers):
     return {name: weight * value for name, value in layers.items()}
 
 
-def _one_sample(kit: gather.Kit, camera, pixel, sample, seed, tally):
+def _one_sample(kit: Kit, camera, pixel, sample, seed, tally):
     rays: Rays = _pixel_rays(camera, pixel, sample, seed)
     hits = first_hit.first_hits(kit.scene, rays, kit.caster)
     receiver = _receiver(kit.scene.mesh, hits, rays.direction)
@@ -102,6 +103,6 @@ def _one_sample(kit: gather.Kit, camera, pixel, sample, seed, tally):
         layers = {name: found[name] for name in SURFACE}
     for name, value in (("surface_from_light", direct), ("surface_from_volume", once), ("surface_from_multiple", more)):
         layers[name] = layers[name] + value
-    thick = gather.thickness(kit, rays.origin, rays.direction, jnp.where(hits.valid, hits.t, 0.0))
+    thick = thickness(kit, rays.origin, rays.direction, jnp.where(hits.valid, hits.t, 0.0))
     through = None if thick is None else jnp.exp(-thick)
     return _reflect(kit.scene.mesh, hits.face, hits.valid, through, layers)
