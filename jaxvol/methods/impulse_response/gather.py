@@ -16,7 +16,7 @@ from jaxvol import ray_casting, sampling
 from jaxvol.methods.impulse_response import emitters, light_sources, surface_paths, walks
 from jaxvol.methods.impulse_response.kit import Kit, Tally, occluded, thickness
 from jaxvol.methods.impulse_response.light_sources import DELTA, Light, delta_lights
-from jaxvol.methods.impulse_response.receivers import Irradiance, Receiver, first_row, like
+from jaxvol.methods.impulse_response.receivers import Irradiance, Receiver, first_row, like, nothing
 from jaxvol.methods.impulse_response.walks import Draw
 
 _STREAM = sampling.stream("impulse_response.lights")
@@ -111,8 +111,7 @@ def _split(once, more, by_table, dropped):
 
 def delta_arrivals(kit: Kit, receiver: Receiver, position: ArrayLike, tally: Tally) -> tuple[Array, Array, Array, Array]:
     """Light of all point, spot and directional lights at the receivers, but for marched segments: no noise. As `light_from`."""
-    shape = jax.eval_shape(receiver.straight, receiver.normal, receiver.normal).shape
-    total = [jnp.zeros(shape, jnp.float32)] * 4
+    total = [nothing(receiver)] * 4
     unused = (jnp.zeros(position.shape[0], jnp.float32),) * 4
     for kind, i in delta_lights(kit.scene):
         index = jnp.full(position.shape[0], i, jnp.int32)
@@ -126,8 +125,7 @@ def sampled_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed,
 
     At depth 0 delta lights send what is marched only: `delta_arrivals` has the rest.
     """
-    shape = jax.eval_shape(receiver.straight, receiver.normal, receiver.normal).shape
-    total = [jnp.zeros(shape, jnp.float32)] * 4
+    total = [nothing(receiver)] * 4
     own = depth == 0
     counts = {kind: sum(k == kind for k, _ in delta_lights(kit.scene)) for kind in DELTA}
     kinds = [kind for kind, count in counts.items() if count and (not own or kit.marches)]

@@ -110,6 +110,12 @@ def like(weight: Float[Array, "n 3"], value: Float[Array, "n *rows 3"]) -> Float
     return weight if value.ndim == 2 else weight[:, None, :]
 
 
+def nothing(receiver: Receiver) -> Float[Array, "n *rows 3"]:
+    """What a receiver makes of no light."""
+    rows = (1 + HARMONICS,) if isinstance(receiver, Incident) else ()
+    return jnp.zeros((receiver.normal.shape[0], *rows, 3), jnp.float32)
+
+
 def first_row(value: Float[Array, "n *rows 3"]) -> Float[Array, "n 3"]:
     """The irradiance, or whatever comes first."""
     return value if value.ndim == 2 else value[:, 0]

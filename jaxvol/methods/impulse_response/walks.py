@@ -1,6 +1,7 @@
 """Stage 3, random walks: the segments that `marched` integrates, chosen and walked between ray casts on the host."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jaxtyping import Array
 from jaxvol.methods.impulse_response import light_sources, marched, surface_paths
 from jaxvol.methods.impulse_response.kit import Kit, occluded, thickness
 from jaxvol.methods.impulse_response.light_sources import Light
-from jaxvol.methods.impulse_response.receivers import Receiver
+from jaxvol.methods.impulse_response.receivers import Receiver, nothing
 
 Draw = Callable[[int], tuple[Array, Array, Array, Array]]
 _RANKS = 1024  # lanes that do not close ranks: compiling for fewer would cost more than it saves
@@ -35,8 +36,7 @@ def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light
     """
     rows, num = np.flatnonzero(chosen), chosen.shape[0]
     if rows.size == 0:
-        zero = jnp.zeros(jax.eval_shape(receiver.straight, light.direction, light.strength).shape, jnp.float32)
-        return zero, zero
+        return nothing(receiver), nothing(receiver)
     lanes = _ranks(rows, num)
     part, position, index, seen = _take((receiver, position, index, light), lanes, num)
     numbers = _take(draw(0), lanes, num)
@@ -88,9 +88,10 @@ def _walk(kit: Kit, normal, position, kind, index, seen, place, rows, num, draw)
 def _ranks(rows, num):
     """Rows filled up to a number of lanes of which there are three, so that few programs are compiled."""
     lanes = next(lanes for lanes in (num // 16, num // 4, num) if rows.size <= lanes and (lanes >= _RANKS or lanes == num))
-    return np.concatenate([rows, np.full(lanes - rows.size, rows[0])])
+    return np.concatenate([rows, np.full(lanes - rows.size, rows[0])]).astype(np.int32)
 
 
+@partial(jax.jit, static_argnames="num")
 def _take(tree, rows, num):
     """Rows of every array of `num` rows."""
     return jax.tree.map(lambda x: x[rows] if jnp.shape(x)[:1] == (num,) else x, tree)
