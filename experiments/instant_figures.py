@@ -83,7 +83,7 @@ def fig1(size, samples):
 
 def fig4(size, samples):
     scene, camera = cube(), square_camera(size)
-    strategies = {f"{v} vertices x 1/{v} of the lights": {"num_chains": v, "light_stride": v} for v in (1, 4, 16)}
+    strategies = {f"vertices: {v}, lights: 1/{v}": {"num_chains": v, "light_stride": v} for v in (1, 4, 16)}
     steps = {
         "unclamped": {"mean_free_paths": None},
         "clamped": {"num_levels": 0},

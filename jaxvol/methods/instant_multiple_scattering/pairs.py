@@ -133,9 +133,9 @@ def closest(origin: Vector, direction: Vector, point: Vector) -> tuple[Float[Arr
 
 
 def henyey_greenstein(cos_theta: Float[Array, "*n"], g: Float[Array, ""]) -> Float[Array, "*n"]:
-    """(1 - g^2) / (4 pi) ((1-|g|)^2 + 2 |g| (1 - sign(g) cos))^(-3/2), with rsqrt; cos is clipped to [-1, 1]."""
+    """(1 - g^2) / (4 pi) ((1-|g|)^2 + 2 |g| (1 - sign(g) cos))^(-3/2), with rsqrt; a cosine above 1 counts as 1."""
     sign = jnp.where(g >= 0, 1.0, -1.0)
     size = g * sign  # not |g|: its derivative at 0 would be 0
-    c = jnp.clip(sign * cos_theta, -1.0, 1.0)
-    q = lax.rsqrt(jnp.maximum((1.0 - size) * (1.0 - size), 1e-12) + 2.0 * size * (1.0 - c))
+    aside = jnp.maximum(1.0 - sign * cos_theta, 0.0)
+    q = lax.rsqrt(jnp.maximum((1.0 - size) * (1.0 - size), 1e-12) + (2.0 * size) * aside)
     return (_INV_4PI * (1.0 - g) * (1.0 + g)) * (q * q * q)
