@@ -9,7 +9,6 @@ three warm frames; the load average stands beside them because wall times on a b
 """
 
 import dataclasses
-import time
 import tomllib
 from unittest import mock
 
