@@ -53,13 +53,14 @@ def traced(scene, points, normals, samples, *, seed=0):
     return np.asarray(layers.total(found.mean)), np.asarray(parts[0]), np.asarray(found.mean.emission)
 
 
-def view(scene, camera, *, samples, media=True, **options):
-    """Surfaces by the bake, and the light that the medium scatters into the eye by `direct`."""
+def view(scene, camera, *, samples, **options):
+    """Surfaces by the bake and light that the medium scatters into the eye by `direct`; a surface-only bake has no medium."""
+    if options.get("scattering") == "surface":
+        scene = dataclasses.replace(scene, medium=None)
     plan = impulse_response.plan(scene, camera, **options)
     surfaces = layers.total(impulse_response.render(scene, camera, plan, samples=samples).mean)
     seen = direct.render(scene, camera, direct.plan(scene, camera)).mean
-    through = np.asarray(surfaces) + np.asarray(seen.emission)
-    return through + np.asarray(seen.volume_from_light) if media else through
+    return np.asarray(surfaces) + np.asarray(seen.emission) + np.asarray(seen.volume_from_light)
 
 
 def show(path, pictures, *, columns=None, exposure=None):
@@ -87,7 +88,7 @@ def canyon_file(width, *overrides):
 def street(out, quick):
     """Like Figure 1: a street with lamps in fog, lit without the medium, with attenuated light, and with all of it."""
     file = canyon_file(120 if quick else 200)
-    samples = 4 if quick else 16
+    samples = 4 if quick else 64
     pictures = {
         "surface-only bake": view(file.scene, file.camera, samples=samples, scattering="surface"),
         "attenuated only": view(file.scene, file.camera, samples=samples, scattering="attenuated"),
@@ -178,6 +179,7 @@ def probe_lit(out, quick):
     mesh.apply_scale(0.9 / mesh.extents.max())
     mesh.apply_translation([0.1, 0.95, 0.1])
     overrides = ["medium.scattering=0.9", "medium.absorption=0.05", "camera.width=200", "camera.height=200"]
+    overrides += ["camera.fov_y=15.0"]
     file = load_scene(HERE / "scenes" / "cornell_fog.toml", overrides=overrides)
     body = make_scene({"shapes": [{"mesh": (np.asarray(mesh.vertices), np.asarray(mesh.faces)), "reflectance": 0.8}]}).scene
     low, step, shape = probes.grid([[-0.95, 0.05, -0.95], [0.95, 1.95, 0.95]], 0.95 if quick else 0.32)
@@ -217,7 +219,7 @@ def _smooth_normals(mesh, points, faces):
 
 def homogeneous(out, quick):
     """Figure 12: attenuated light alone against everything, with the eye rays' scattering by `direct`; lamps, then a sun."""
-    width, samples = (100, 4) if quick else (160, 16)
+    width, samples = (100, 4) if quick else (160, 64)
     lamps = canyon_file(width)
     sun = make_sun(lamps)
     pictures = {}
@@ -237,8 +239,8 @@ def make_sun(file):
 def lightmap_against_reference(out, quick):
     """Irradiance at the texels of the Cornell box in fog, a bounded medium: the bake, the path tracer, and errors by mode."""
     file = load_scene(HERE / "scenes" / "cornell_fog.toml")
-    what = lightmap.unwrap(file.scene.mesh, resolution=32 if quick else 64)
-    truth, variance, _ = traced(file.scene, what.receiver, what.normal, 128 if quick else 1024)
+    what = lightmap.unwrap(file.scene.mesh, resolution=32 if quick else 48)
+    truth, variance, _ = traced(file.scene, what.receiver, what.normal, 128 if quick else 4096)
     rows, pictures = [], {"path tracing": _atlas(what, truth)}
     cases = {
         "ours": {},
@@ -255,7 +257,7 @@ def lightmap_against_reference(out, quick):
             what.receiver,
             what.normal,
             name=name,
-            samples=64 if quick else 512,
+            samples=64 if quick else 1024,
         )
         rows.append(errors(f"cornell_fog, {name}", baking.total(found), truth, variance) | found.shares)
         pictures[f"{name}: {rows[-1]['relative_l1']:.1%}"] = _atlas(what, baking.total(found))
