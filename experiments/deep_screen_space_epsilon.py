@@ -32,14 +32,14 @@ def main():
                 if radius == "quadratic" and tail and blur in crops:
                     crops[blur].append(image)
     write_csv("epsilon.csv", ["radius", "tail", "epsilon", "blur", "relative_l1", "bias", "pairs"], rows)
-    fig, axes = plt.subplots(figsize=(6.0, 4.0), constrained_layout=True)
+    fig, axes = plt.subplots(figsize=(8.0, 4.0), constrained_layout=True)
     for radius, tail in (("quadratic", True), ("quadratic", False), ("paper", True), ("paper", False)):
         for blur, style in (("none", ":"), ("paper", "--"), ("demodulated", "-")):
             line = [(r[6], r[4]) for r in rows if r[0] == radius and r[1] == tail and r[3] == blur]
             axes.loglog(*zip(*line, strict=True), style, marker="o", markersize=3, label=f"{radius}, tail {tail}, {blur}")
     axes.set_xlabel("pairs evaluated")
     axes.set_ylabel("relative L1 against all pairs")
-    axes.legend(fontsize=6)
+    axes.legend(fontsize=6, loc="center left", bbox_to_anchor=(1.0, 0.5))
     fig.savefig(out("epsilon.png"), dpi=110)
     plt.close(fig)
     titles = [f"epsilon {e}" for e in settings["epsilons"]]
