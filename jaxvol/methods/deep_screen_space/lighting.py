@@ -196,14 +196,18 @@ def _kd_order(points: Float[np.ndarray, "S D"], *, leaf: int) -> Int[np.ndarray,
         size *= 2
     order = np.arange(num)
     while size > leaf:
-        pieces = []
-        for begin in range(0, num, size):
-            piece = order[begin : begin + size]
-            if piece.size > size // 2:
-                part = points[piece]
-                axis = np.ptp(part, axis=0).argmax()
-                piece = piece[np.argpartition(part[:, axis], size // 2)]
-            pieces.append(piece)
-        order = np.concatenate(pieces) if pieces else order
+        full = num // size * size
+        rest = order[full:]
+        parts = [_halved(points, order[:full].reshape(-1, size), size // 2)] if full else []
+        parts.append(_halved(points, rest[None], size // 2) if rest.size > size // 2 else rest)
+        order = np.concatenate([part.reshape(-1) for part in parts])
         size //= 2
     return order
+
+
+def _halved(points, rows, half):
+    """Rows [n, m] of indices, each with the `half` lowest along its widest axis first."""
+    part = points[rows]
+    axis = np.ptp(part, axis=1).argmax(axis=1)
+    along = np.take_along_axis(part, axis[:, None, None], axis=2)[..., 0]
+    return np.take_along_axis(rows, np.argpartition(along, half, axis=1), axis=1)

@@ -1,5 +1,6 @@
 """What a frame needs to know before it starts: options, static shapes, what the scene lets it skip."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ LAYER = "volume_from_surface"
 BOUNCE_LAYER = "volume_from_multiple"
 TRANSPORTS = ("table", "none")
 WEIGHTS = ("exact", "paper")
+_STRIDES = (1, 2, 4, 8, 8, 8, 8)  # neighbours take other samples, and the blur of coarse levels averages over them
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ def plan(
     if cluster_size < 16 or cluster_size & (cluster_size - 1):
         raise ValueError(f"cluster_size = {cluster_size} must be a power of two, at least 16")
     if strides is None:
-        strides = tuple(s if num_intervals % s == 0 else 1 for s in (1, 1, 2, 4, 4, 4, 4)[:num_levels])
+        strides = tuple(math.gcd(s, num_intervals) for s in _STRIDES[:num_levels])
     if len(strides) != num_levels or any(s < 1 or num_intervals % s for s in strides):
         raise ValueError(f"strides = {strides} must give each of the {num_levels} levels a divisor of {num_intervals}")
     if weights == "paper" and position == "midpoint":
