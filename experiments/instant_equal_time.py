@@ -28,11 +28,11 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points
 NODES = 20  # points per eye ray for single scattering
 SPP = (16, 64, 256)
 OURS = {  # options, and numbers of light paths
-    "every light": ({}, (1024, 4096)),
+    "every light": ({"max_lights": None}, (1024, 4096)),
     "virtual ray lights": ({"lights": "rays"}, (1024, 2048)),
     "chosen lights": ({"max_lights": 1024}, (4096, 16384)),
     "more chosen lights": ({"max_lights": 2048, "num_direct": 8}, (16384, 32768)),
-    "low resolution, every light": ({"upsample": 4, "num_direct": 16}, (4096, 16384)),
+    "low resolution, every light": ({"upsample": 4, "max_lights": None, "num_direct": 16}, (4096, 16384)),
     "low resolution, chosen lights": ({"upsample": 4, "max_lights": 4096, "num_direct": 32}, (16384, 32768)),
 }
 
