@@ -75,7 +75,7 @@ def light_from(
     `pick` chooses single nodes of the tables. `own`: the receivers are those of the bake, whose segments may be marched: by
     the random numbers `draw`, or left out where None. `smooth` False leaves out what `draw` None gives: the two add up.
     """
-    light = light_sources.see(kit.scene, position, kind, index, u)
+    light = light_sources.see(kit.scene, position, receiver.normal, kind, index, u, scatters=kit.responses is not None)
     visible = ~occluded(kit, *light_sources.shadow_ray(kit.faces.scale, position, receiver.normal, light))
     by_march = own and kit.marches
     chosen = walks.by_marching(kit, position, receiver.normal, light, visible) if by_march else None

@@ -35,9 +35,13 @@ def delta_lights(scene: Scene) -> list[tuple[str, int]]:
     return found
 
 
-@partial(jax.jit, static_argnames="kind")
-def see(scene, position, kind, index, u) -> Light:
-    """The light of a kind: `index` [n] for point, spot and directional ones, a random one of the rest by u."""
+@partial(jax.jit, static_argnames=("kind", "scatters"))
+def see(scene, position, normal, kind, index, u, *, scatters: bool) -> Light:
+    """The light of a kind: `index` [n] for point, spot and directional ones, a random one of the rest by u.
+
+    Directions to the sky by its map and by the cosine about `normal` (balance heuristic), by the cosine alone where the sky is
+    constant and no medium `scatters` what comes from below the horizon.
+    """
     if kind in ("point", "spot"):
         group = scene.point_lights if kind == "point" else scene.spot_lights
         delta = group.position[index] - position
@@ -52,7 +56,13 @@ def see(scene, position, kind, index, u) -> Light:
         group = scene.directional_lights
         return Light(-group.direction[index], infinite, group.irradiance[index], infinite=True)
     if kind == "environment":
-        direction, pdf = lights.sample_environment(scene.environment, u[0], u[1])
+        constant = scene.environment.radiance.shape[:2] == (1, 1)
+        share = 1.0 if constant and not scatters else 0.5
+        mapped, _ = lights.sample_environment(scene.environment, u[0], u[1])
+        direction = jnp.where((u[2] < share)[:, None], sampling.sample_cosine_hemisphere(u[0], u[1], normal), mapped)
+        pdf = share * sampling.sample_cosine_hemisphere_pdf(dot(normal, direction))
+        pdf = pdf + (1 - share) * lights.sample_environment_pdf(scene.environment, direction)
+        pdf = jnp.maximum(pdf, 1e-9)  # at the very horizon, where nothing arrives
         radiance = lights.environment_radiance(scene.environment, direction)
         return Light(direction, infinite, radiance / pdf[:, None], infinite=True)
     group, mesh = scene.area_lights, scene.mesh

@@ -4,8 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import direct, harmonics, layers
+from jaxvol import direct, harmonics, layers, lights
 from jaxvol.methods import impulse_response
+from jaxvol.methods.impulse_response import light_sources, probes
 from jaxvol.methods.impulse_response.receivers import Reflection
 from jaxvol.scene import make_scene
 from jaxvol.types import Medium, Mesh, PointLights, Scene, SpotLights
@@ -268,3 +269,25 @@ def test_phong_lobe_of_scattered_light():
     receiver = Reflection(one(normal), one(axis), jnp.zeros((1, 3)), jnp.ones((1, 3)), one(80.0))
     found = receiver.zonal(one(zonal)[:, None], one([0.6, 0.0, 0.8]))
     np.testing.assert_allclose(found[0], truth, rtol=0.02)
+
+
+@pytest.mark.parametrize("rows", [1, 8])
+def test_the_sky_lights_an_open_plane(rows):
+    """A constant sky without noise, a map against its quadrature; with a medium all directions are found."""
+    columns = 2 * rows if rows > 1 else 1
+    radiance = np.random.default_rng(0).uniform(0, 2, (rows, columns, 3)).astype(np.float32)
+    light = lights.environment_light(radiance)
+    scene = open_plane(0.9, medium=None, point_lights=None, environment=light)
+    points, normals = receivers()
+    estimate = impulse_response.irradiance(scene, points, normals, samples=1 if rows == 1 else 4096)
+    w, weight = probes.directions(num_polar=64)
+    arriving = np.asarray(lights.environment_radiance(light, jnp.asarray(w, jnp.float32)), np.float64)
+    truth = np.einsum("n,n,nc->c", weight, np.maximum(w[:, 2], 0), arriving)
+    tolerance = 1e-5 if rows == 1 else 0.03
+    truth = np.pi * radiance[0, 0] if rows == 1 else truth
+    np.testing.assert_allclose(estimate.mean.surface_from_light, np.broadcast_to(truth, (5, 3)), rtol=tolerance)
+    u = [jnp.asarray(x, jnp.float32) for x in np.random.default_rng(1).random((4, 20000))]
+    place, up = jnp.zeros((20000, 3)), jnp.tile(jnp.array([0.0, 0, 1]), (20000, 1))
+    seen = light_sources.see(scene, place, up, "environment", jnp.zeros(20000, jnp.int32), u, scatters=True)
+    whole = np.einsum("n,nc->c", weight, arriving) if rows > 1 else 4 * np.pi * radiance[0, 0]
+    np.testing.assert_allclose(np.mean(seen.strength, axis=0), whole, rtol=0.03)
