@@ -85,7 +85,7 @@ def test_a_wrong_method_is_caught(monkeypatch, wrong, complaint):
 def test_light_from_nothing_is_caught(monkeypatch):
     monkeypatch.setattr(checks, "render", lambda config, method, seed=0: Layers(emission=jnp.full((2, 2, 3), 1.1)))
     config = scenes.draw("fog_furnace", np.random.default_rng(1))
-    assert any("furnace: mean 1.1" in line for line in driver.run_case(config, 8, "fog_furnace", "any")["failed"])
+    assert any("their mean 1.1" in line for line in driver.run_case(config, 8, "fog_furnace", "any")["failed"])
 
 
 def test_a_crash_is_a_failure_and_a_refusal_is_none(monkeypatch):

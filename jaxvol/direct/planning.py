@@ -10,6 +10,7 @@ from jaxvol.types import Camera, Mesh, Scene
 
 _MOST_STEPS = 256
 _THICK_VOXEL = 1.2  # optical thickness beyond which light from the sky changes too fast from voxel to voxel
+_BROAD = 0.5  # mean cosine up to which half the directions of the sky do
 _PEAKED = 0.8  # mean cosine beyond which a few hundred directions of the sky miss the peak
 
 
@@ -101,8 +102,8 @@ def plan(
     across = 0 if scene.medium is None else extinction.num_voxels_across(scene.medium)
     # A map with a sun in it needs more directions than a sky of one radiance; without a grid they cost little.
     is_map = scene.environment is not None and scene.environment.radiance.shape[:2] != (1, 1)
-    if num_sky_directions is None:
-        num_sky_directions = 512
+    if num_sky_directions is None:  # 256 at g = .4 are within .02 % of 512, at g = .7 within .15 %
+        num_sky_directions = 512 if volume and abs(float(scene.medium.g)) > _BROAD else 256
     if not (volume and _has_field(scene, camera)):
         num_sky_directions = 0
     if num_environment_samples is None:

@@ -10,8 +10,8 @@ from jaxvol import jobs
 from jaxvol.stress import checks, extremes, scenes
 
 RESULTS = "stress.jsonl"
-# Of each class every second scene in other units, every tenth turned, every fourth furnace looked at for energy.
-_EVERY_UNITS, _EVERY_TURN, _EVERY_FURNACE = 2, 10, 4
+# Of each class every second scene in other units, every tenth turned.
+_EVERY_UNITS, _EVERY_TURN = 2, 10
 
 Record = dict[str, Any]
 
@@ -55,7 +55,7 @@ def run_case(config: scenes.Config, number: int | None, name: str, method: str) 
                 note("units", checks.unit_free(config, method, base, factor=factor))
             if turn is not None and turn % _EVERY_TURN == 0:
                 note("turned", checks.turns(config, method))
-            if name.endswith("furnace") and turn % _EVERY_FURNACE == 0:
+            if name.endswith("furnace"):
                 note("furnace", checks.furnace(config, method))
         except checks.Refused as error:  # the scene was taken before: its other forms must be, but for numbers out of range
             note("range" if "must be" in str(error) else "refused", None if "must be" in str(error) else str(error))
