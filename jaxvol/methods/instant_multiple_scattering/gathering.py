@@ -23,6 +23,7 @@ from jaxvol.types import Medium
 _TILE = 1024  # receivers whose numbers stay in the cache
 _WIDTH = 16384  # lanes of a step: enough to hide the steps' overhead
 _INV_4PI = 0.07957747154594767
+_THICKEST = 30.0  # optical thickness at which estimates stop falling
 
 
 class Light(NamedTuple):
@@ -108,6 +109,28 @@ def extinguish(value: Vector, scale: Float[Array, "*n"], sigma_t: Vector, column
         return tuple(v * factor for v in value)
     scale = lax.optimization_barrier(scale)
     return tuple(v * scale * jnp.exp(-s * column) for v, s in zip(value, sigma_t, strict=True))
+
+
+def reflected_estimate(
+    points: Points,
+    light: Light,
+    medium: Medium | None,
+    clamp: Float[Array, "*n"] | None,
+    sigma: Float[Array, ""] | float,
+    *,
+    isotropic: bool,
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """What points send on of lights, mean over channels, unoccluded and at the extinction `sigma`; and min(1/r^2, b)."""
+    r2, distance, towards = pairs.separation(pairs.components(points.position), light.position, clamp)
+    sent, factor = leaving(light, towards, medium, isotropic=isotropic)
+    received = pairs.mean(scattered(points, towards, medium, isotropic=isotropic))
+    bounded = pairs.inverse_square(r2, clamp)
+    return pairs.mean(sent) * factor * received * bounded * floored_exp(sigma * distance), bounded
+
+
+def floored_exp(depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """exp(-depth), at least exp(-30): an estimate that picks by it must not underflow to zero."""
+    return jnp.exp(-jnp.minimum(depth, _THICKEST))
 
 
 class RayPoint(NamedTuple):

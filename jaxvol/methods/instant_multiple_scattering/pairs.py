@@ -31,6 +31,11 @@ def dot(a: Vector, b: Vector) -> Float[Array, "*n"]:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def mean(v: Vector) -> Float[Array, "*n"]:
+    """Mean of the three components."""
+    return (v[0] + v[1] + v[2]) * (1.0 / 3.0)
+
+
 def combine(a: Vector, s: Float[Array, "*n"], b: Vector) -> Vector:
     """a + s b."""
     return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]

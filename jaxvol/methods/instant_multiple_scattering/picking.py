@@ -22,7 +22,6 @@ from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segment
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
 from jaxvol.types import Medium
 
-_THICKEST = 30.0  # optical thickness at which the estimate stops falling: it must not underflow to zero
 _LEAST = 1e-3  # share of the mean density that the estimate assumes where the table says there is none
 
 
@@ -98,10 +97,6 @@ def _pick(estimate, lights, u, num_groups, num_payload):
     return lax.scan(group, None, (*_deal(lights, num_groups), starts))[1]
 
 
-def _mean(value):
-    return (value[0] + value[1] + value[2]) * (1.0 / 3.0)
-
-
 def _mean_density(medium):
     return 1.0 if medium.density is None else jnp.mean(medium.density)
 
@@ -130,7 +125,7 @@ def pick_for_segments(
         # A step beside one that holds density is not empty: the table blurs over a step.
         padded = jnp.pad(density, ((1, 1), (0, 0)), mode="edge")
         density = jnp.maximum(jnp.maximum(padded[:-2], padded[2:]), density)
-        source = (density + _LEAST * mean_density) * jnp.exp(-jnp.minimum(sigma * ends[1:], _THICKEST))
+        source = (density + _LEAST * mean_density) * gathering.floored_exp(sigma * ends[1:])
         flat = source.reshape(-1)
         lanes = jnp.arange(u.shape[0])
 
@@ -138,7 +133,7 @@ def pick_for_segments(
         v = gathering.shifted(u, shift)
         point = gathering.choose_point(origin, direction, segments, light.position, v, stratified=stratified)
         sent, factor = gathering.leaving(light, point.towards, medium, isotropic=isotropic)
-        value = _mean(sent) * factor * point.weight
+        value = pairs.mean(sent) * factor * point.weight
         value = value * gathering.phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
         along = point.t - segments.t0
         depth = sigma * mean_density * point.distance
@@ -147,7 +142,7 @@ def pick_for_segments(
             value = value * flat[step * u.shape[0] + lanes]
         else:
             depth = depth + sigma * along
-        return value * jnp.exp(-jnp.minimum(depth, _THICKEST)), (point.t, point.weight)
+        return value * gathering.floored_exp(depth), (point.t, point.weight)
 
     light, scale, t, weight = _pick(estimate, lights, u_group, num_groups, 2)
     alive = segments.t1 > segments.t0
@@ -165,15 +160,10 @@ def pick_for_points(
     isotropic: bool,
 ) -> Picks:
     """For each point and group one light."""
-    position = pairs.components(points.position)
     sigma = 0.0 if medium is None else jnp.mean(media.sigma_t(medium)) * _mean_density(medium)
 
     def estimate(light, _):
-        r2, distance, towards = pairs.separation(position, light.position, points.clamp)
-        sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
-        received = _mean(gathering.scattered(points, towards, medium, isotropic=isotropic))
-        bounded = pairs.inverse_square(r2, points.clamp)
-        value = _mean(sent) * factor * received * bounded * jnp.exp(-jnp.minimum(sigma * distance, _THICKEST))
+        value, bounded = gathering.reflected_estimate(points, light, medium, points.clamp, sigma, isotropic=isotropic)
         return value, (bounded,)
 
     light, scale, bounded = _pick(estimate, lights, u, num_groups, 1)

@@ -28,7 +28,6 @@ _SELECTION = sampling.stream("instant_multiple_scattering.selection")
 _PILOTS = 8  # pilot pixels, each way
 _FLOOR = 0.1  # share of the choice that goes by power alone
 _MIDDLE = 0.4  # of the angle that a ray subtends at a light: where the pilots meet it
-_THICKEST = 30.0  # optical thickness beyond which the weighing goes no lower
 _BITS = 10  # of a coordinate in the order along which lights are spread
 
 
@@ -102,17 +101,13 @@ def importance(
             value = value + density * _along(row.segments, light, scene.medium, soft, sigma, isotropic)
         if row.points is not None:
             length = jnp.sqrt(sampling.dot(row.points.position - eye, row.points.position - eye))
-            tau = jnp.exp(-jnp.minimum(sigma * length, _THICKEST))
-            value = value + row.seen * tau * _reflected(row.points, light, scene.medium, soft, sigma, isotropic)
+            seen, _ = gathering.reflected_estimate(row.points, light, scene.medium, soft, sigma, isotropic=isotropic)
+            value = value + row.seen * gathering.floored_exp(sigma * length) * seen
         share = value / jnp.maximum(jnp.sum(value), 1e-30)
         return total + share * share, None
 
     total, _ = lax.scan(body, jnp.zeros_like(soft), rows)
     return jnp.sqrt(total * (1.0 / (_PILOTS * _PILOTS)))
-
-
-def _mean(value):
-    return (value[0] + value[1] + value[2]) * (1.0 / 3.0)
 
 
 def _along(segment, light, medium, soft, sigma, isotropic):
@@ -123,18 +118,8 @@ def _along(segment, light, medium, soft, sigma, isotropic):
     sent, factor = gathering.leaving(light, point.towards, medium, isotropic=isotropic)
     f = gathering.phase_value(medium, -pairs.dot(point.towards, direction), isotropic=isotropic)
     depth = sigma * (point.distance + point.t - segment.t0)
-    value = _mean(sent) * factor * point.weight * f * _mean(medium.sigma_s) * jnp.exp(-jnp.minimum(depth, _THICKEST))
+    value = pairs.mean(sent) * factor * point.weight * f * pairs.mean(medium.sigma_s) * gathering.floored_exp(depth)
     return jnp.where(segment.t1 > segment.t0, value, 0.0)
-
-
-def _reflected(point, light, medium, soft, sigma, isotropic):
-    """What one point of a surface reflects of every light."""
-    position = pairs.components(point.position)
-    r2, distance, towards = pairs.separation(position, light.position, soft)
-    sent, factor = gathering.leaving(light, towards, medium, isotropic=isotropic)
-    received = _mean(gathering.scattered(point, towards, medium, isotropic=isotropic))
-    depth = jnp.exp(-jnp.minimum(sigma * distance, _THICKEST))
-    return _mean(sent) * factor * received * pairs.inverse_square(r2, soft) * depth
 
 
 def place_along_curve(position: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
