@@ -46,7 +46,7 @@ def radiance(scene: Scene, rays: Rays, plan: Plan, light: Illumination, *, seed:
             t_max = np.minimum(t_max, ray_casting.intersect(ray_casting.caster_for(scene.mesh), origin, direction, t_max)[0])
         volume, _ = gather_straight(
             scene.medium, extinction.marching_medium(scene.medium), segments.medium_casters(scene.medium), grid, table,
-            layout, origin, direction, t_max, step=plan.view_step, degree=plan.degree,
+            layout, origin, direction, t_max, step=plan.view_step, degree=plan.degree, blocks=light.blocks,
         )  # fmt: skip
         rest = {}
     return {name: volume[:, k] * (light.unit * light.spectrum) for k, name in enumerate(names)} | rest

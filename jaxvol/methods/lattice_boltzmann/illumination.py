@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, fresnel, light_rays, marching, preconditioner
+from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, fresnel, light_rays, marching, occupancy, preconditioner
 from jaxvol.methods.lattice_boltzmann import materials as material_pass
 from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice, shift
 from jaxvol.methods.lattice_boltzmann.materials import Materials
@@ -36,6 +36,7 @@ class Illumination(NamedTuple):
     from_surface: Float[Array, "C X Y Z"] | None
     from_volume: Float[Array, "C X Y Z"]  # scattered once, straight from the lights before
     scattered: Float[Array, "C X Y Z"]  # scattered at all, in the medium
+    blocks: Bool[Array, "BX BY BZ"] | None  # filled ones (occupancy.py); None where all are walked
     unit: float  # W: a power of two near what the lights send; numbers over it neither overflow nor vanish when squared
     diagnostics: dict[str, Array]
     unscattered: Unscattered | None = None  # of from_light; None when scattering is isotropic
@@ -52,6 +53,7 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     )
     if plan.walls:
         materials = material_pass.with_surfaces(materials, scene.mesh, num_channels=plan.num_channels)
+    blocks = None if plan.refract else occupancy.filled_blocks(materials)
     report("voxelize")
     low = np.asarray(grid.lower, float)
     high = low + float(grid.voxel) * np.array(grid.shape)
@@ -65,13 +67,13 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
             bounced = enter_body(scene, bounced)
     unit = _unit(rays.power if bounced is None else np.concatenate([rays.power, bounced.power]))
     power, spectrum = _channels(rays.power / unit, plan.num_channels)
-    marched = march(materials, plan, rays, power, seed)
+    marched = march(materials, plan, rays, power, seed, blocks)
     track, books = marched.track, [marched]
     from_surface = None
     if bounced is not None:
         power = bounced.power / unit
         power = power if plan.num_channels == 3 else (power @ spectrum / (spectrum @ spectrum))[:, None]
-        second = march(materials, plan, bounced, power, seed)
+        second = march(materials, plan, bounced, power, seed, blocks)
         from_surface = second.track
         books.append(second)
     report("march")
@@ -112,7 +114,7 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     )
     forward = [None if b.unscattered is None else b.unscattered._replace(track=unit * b.unscattered.track) for b in books]
     return Illumination(
-        materials, spectrum, track, from_surface, from_volume, scattered, unit, diagnostics, *forward,
+        materials, spectrum, track, from_surface, from_volume, scattered, blocks, unit, diagnostics, *forward,
         *[None] * (2 - len(books)), flux,
     )  # fmt: skip
 
@@ -222,7 +224,14 @@ class _Light(NamedTuple):
     unscattered: Unscattered | None
 
 
-def march(materials: Materials, plan: Plan, rays: light_rays.LightRays, power: np.ndarray, seed: int) -> _Light:
+def march(
+    materials: Materials,
+    plan: Plan,
+    rays: light_rays.LightRays,
+    power: np.ndarray,
+    seed: int,
+    blocks: Bool[Array, "X Y Z"] | None = None,
+) -> _Light:
     """Straight or bent, as planned; with anisotropic scattering every channel twice, with and without the forward part."""
     if plan.first_order:
         materials, power = material_pass.twice(materials, degree=plan.degree), np.concatenate([power, power], axis=1)
@@ -232,7 +241,9 @@ def march(materials: Materials, plan: Plan, rays: light_rays.LightRays, power: n
             step=plan.march_step, integrator=plan.integrator, seed=seed, with_flow=plan.first_order,
         )  # fmt: skip
     else:
-        found = marching.march_straight(materials, rays.origin, rays.direction, rays.t_max, power, with_flow=plan.first_order)
+        found = marching.march_straight(
+            materials, rays.origin, rays.direction, rays.t_max, power, with_flow=plan.first_order, blocks=blocks
+        )
     num = plan.num_channels
     books = [x[:num] for x in (found.sent, found.live, found.escaped)]
     if not plan.first_order:

@@ -21,7 +21,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials
+from jaxvol.methods.lattice_boltzmann.materials import Materials
+from jaxvol.methods.lattice_boltzmann.occupancy import narrowed, to_voxels
 
 Integrator = Literal["leapfrog", "smooth", "euler"]
 _ROUND = 16  # steps between re-packings
@@ -60,17 +61,6 @@ class _Bent(NamedTuple):
     inside: Bool[Array, "n"]
 
 
-def to_voxels(grid: Grid, origin: np.ndarray, direction: np.ndarray, t_max: np.ndarray):
-    """Rays in voxel units, clipped to the grid: (position, direction, t0, t1) with empty rays t1 <= t0."""
-    position = (np.asarray(origin, np.float64) - np.asarray(grid.lower, np.float64)) / float(grid.voxel)
-    direction = np.asarray(direction, np.float64)
-    safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    a, b = -position / safe, (np.array(grid.shape) - position) / safe
-    t0 = np.maximum(np.minimum(a, b).max(1), 0.0)
-    t1 = np.minimum(np.maximum(a, b).min(1), np.asarray(t_max, np.float64) / float(grid.voxel))
-    return position, safe, t0, t1
-
-
 def march_straight(
     materials: Materials,
     origin: np.ndarray,
@@ -79,15 +69,23 @@ def march_straight(
     power: np.ndarray,
     *,
     with_flow: bool = False,
+    blocks: Bool[Array, "X Y Z"] | None = None,
 ) -> Marched:
-    """Through the voxels on straight lines; `power` [n, C] at the origin (what lies outside the grid is vacuum)."""
+    """Through the voxels on straight lines; `power` [n, C] at the origin (what lies outside the grid is vacuum).
+
+    `blocks` (occupancy.py): rays are walked between the first and the last of them only, and leave no track elsewhere.
+    """
     grid = materials.grid
     position, direction, t0, t1 = to_voxels(grid, origin, direction, t_max)
+    enters = t1 > t0
+    t0, t1 = narrowed(blocks, position, direction, t0, t1)
     live = np.flatnonzero(t1 > t0)
     channels = tuple(materials.scattering[c] + materials.absorption[c] for c in range(materials.scattering.shape[0]))
     flat = tuple(x.reshape(-1) for x in channels)
     track = _dark_track(flat, with_flow)
     books = _Books(power.shape[1])
+    passing = power[enters & (t1 <= t0)].sum(0, dtype=np.float64)  # through empty blocks only
+    books.sent, books.escaped = books.sent + passing, books.escaped + passing
     for first in range(0, len(live), _BATCH):
         chosen = live[first : first + _BATCH]
         rays = _enter(grid.shape, position[chosen], direction[chosen], t0[chosen], t1[chosen], power[chosen])

@@ -116,8 +116,9 @@ def make_grid(medium: Medium, *, resolution: int, margin: int = 0) -> Grid:
     low, high = body_bounds(medium)
     voxel = float(np.max(high - low)) / resolution
     count = np.maximum(np.ceil((high - low) / voxel - 1e-4).astype(int), 1) + 2 * margin
-    lower = 0.5 * (low + high) - 0.5 * voxel * count
     exact = np.isclose((high - low) / voxel, np.round((high - low) / voxel), atol=1e-4)
+    count = np.where(exact, count, -(-count // 4) * 4)  # few shapes: a body that moves a little compiles nothing anew
+    lower = 0.5 * (low + high) - 0.5 * voxel * count
     lower = np.where(exact, low - margin * voxel, lower)
     return Grid(jnp.asarray(lower, jnp.float32), jnp.float32(voxel), tuple(int(n) for n in count))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxvol import direct, media, ray_casting
 from jaxvol.methods.lattice_boltzmann import fresnel
-from jaxvol.methods.lattice_boltzmann.marching import to_voxels
+from jaxvol.methods.lattice_boltzmann.occupancy import to_voxels
 from jaxvol.methods.lattice_boltzmann.view import gather_bent
 from jaxvol.types import Rays, Scene
 

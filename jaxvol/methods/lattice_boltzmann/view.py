@@ -20,12 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxvol import extinction, phase, segments
 from jaxvol.methods.lattice_boltzmann.anisotropy import eigenvalues, mean_direction
-from jaxvol.methods.lattice_boltzmann.marching import STEPS, bent_table, corner_table, enters, interpolate, to_voxels
+from jaxvol.methods.lattice_boltzmann.marching import STEPS, bent_table, corner_table, enters, interpolate
 from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials, mean_cosine, reduced_sigma, regions
+from jaxvol.methods.lattice_boltzmann.occupancy import narrowed, to_voxels
 from jaxvol.types import Medium
 
 _DARK = 1e-4  # transmittance at which a ray has seen enough
@@ -126,6 +127,7 @@ def gather_straight(
     *,
     step: float,
     degree: int = 0,
+    blocks: Bool[Array, "X Y Z"] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(radiance [n, L, C], transmittance [n, C]) along straight rays up to t_max; `step` in voxels at most.
 
@@ -142,7 +144,8 @@ def gather_straight(
         else segments.segments(medium, origin, direction, t_max, casters=casters)
     )
     t, region = np.asarray(pieces.t), np.asarray(pieces.region)
-    _, _, enter, leave = to_voxels(grid, origin, direction, t_max)  # around the grid the medium is empty
+    clipped = to_voxels(grid, origin, direction, t_max)  # around the grid, and outside `blocks`, the medium is empty
+    enter, leave = narrowed(blocks, *clipped)
     enter, leave = (np.float32(float(grid.voxel) * x)[:, None] for x in (enter, leave))
     t = np.clip(t, enter, np.maximum(enter, leave))
     length = np.where((region >= 0).any(1), t[:, -1] - t[:, 0], 0.0)
