@@ -59,7 +59,7 @@ def bake(
     ] = None,
     bounded: Annotated[
         float | None,
-        typer.Option(help="Mean free paths across the medium, below which all is marched; 0 = never. Default: 10.", min=0),
+        typer.Option(help="Mean free paths across the medium, below which all is marched; 0 = never. Default: 7.", min=0),
     ] = None,
     legs: Annotated[
         int | None,

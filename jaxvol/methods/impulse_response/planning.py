@@ -16,7 +16,7 @@ Scattering = Literal["surface", "attenuated", "single", "multiple"]
 Occlusion = Literal["march", "drop"]
 _MODES = ("surface", "attenuated", "single", "multiple")
 CONTRAST = 0.5  # of density along a segment, above which it is marched
-BOUNDED = 10.0  # mean free paths across the medium, below which its bounds count everywhere
+BOUNDED = 7.0  # mean free paths across the medium, below which its bounds count everywhere
 _MOST_LEGS = 8  # of marched segments in a bounded medium, before the tables' infinite medium takes over
 
 
