@@ -18,15 +18,16 @@ from jaxvol.image import choose_exposure, tone_map
 
 
 def moved(problem, camera, phase):
-    """Scene and camera at a phase in [0, 1): lamp on a circle, walls breathing, density swirling, camera swaying."""
+    """Scene and camera at a phase in [0, 1): lamp on a circle, walls breathing, column of smoke swaying, camera swaying."""
     turn = 2.0 * np.pi * phase
     lamp = jnp.array([[0.6 * np.cos(turn), 0.8, 0.5 * np.sin(turn)]], jnp.float32)
     vertices = problem.mesh.vertices
     wave = 0.12 * np.sin(turn) * jnp.sin(3.0 * vertices[:, 1]) * (vertices[:, 2] < 0.0)
     vertices = vertices.at[:, 2].add(wave)
     density = problem.medium.density
-    shift = int(round(phase * density.shape[0]))
-    density = 0.5 * (density + jnp.flip(jnp.roll(density, shift, axis=0), axis=2))
+    x, height = (jnp.arange(n) for n in density.shape[:2])
+    sway = jnp.round(0.12 * x.size * jnp.sin(turn + 6.0 * height / height.size) * height / height.size).astype(jnp.int32)
+    density = density[jnp.clip(x[:, None] - sway, 0, x.size - 1), height[None]]  # the column bends, more the higher
     eye = [1.1 * np.sin(turn), 0.25 * np.cos(turn), 4.1]
     scene = eqx.tree_at(
         lambda s: (s.point_lights.position, s.mesh.vertices, s.medium.density, s.medium.majorants),

@@ -86,6 +86,15 @@ def depth_pictures(problem, camera):
     return [np.nan_to_num((d[i] - low) / (high - low)).reshape(camera.height, camera.width) for i in (0, 5, 10, 15)]
 
 
+def jitter_pictures(problem, camera):
+    """Banding of few samples and long steps, and the noise that takes its place; nothing blurred, so that both are seen."""
+    bare = {"blur": "none", "radius": "quadratic", "tail": True, "epsilon": 0.03, "num_surfels": 2048}
+    coarse = PAPER | bare | {"num_steps": 24, "num_intervals": 5, "strides": (1,) * 6}
+    images = [layer(problem, camera, **(coarse | {"position": position})) for position in ("far", "jittered")]
+    exact = layer(problem, camera, **bare, transport="none", strides=(1,) * 6)
+    pictures("jitter.png", [[*images, exact]], titles=["paper, 5 samples", "jittered", "exact, 16 samples"])
+
+
 def main():
     """All four."""
     settings = config()
@@ -98,6 +107,8 @@ def main():
     fig, axes = plt.subplots(figsize=(5.0, 3.6), constrained_layout=True)
     for name in dict.fromkeys(r[0] for r in rows):
         axes.loglog(*zip(*[(r[1], r[3]) for r in rows if r[0] == name and r[2] == 200], strict=True), marker="o", label=name)
+    axes.set_xticks(settings["intervals"], settings["intervals"])
+    axes.minorticks_off()
     axes.set_xlabel("intervals")
     axes.set_ylabel("relative L1")
     axes.legend()
@@ -110,11 +121,7 @@ def main():
         axis.set_axis_off()
     fig.savefig(out("depths.png"), dpi=110)
     plt.close(fig)
-    coarse = PAPER | {"num_steps": 24, "num_surfels": 2048}
-    with_jitter = layer(problem, camera, **coarse)
-    without = layer(problem, camera, **(coarse | {"position": "far"}))
-    exact = layer(problem, camera, num_surfels=2048)
-    pictures("jitter.png", [[without, with_jitter, exact]], titles=["paper, 24 steps, no jitter", "jittered", "exact map"])
+    jitter_pictures(problem, camera)
 
 
 if __name__ == "__main__":
