@@ -18,8 +18,8 @@ from jaxvol.scene import load_scene
 SCENE = Path(__file__).resolve().parent / "scenes" / "les_cumulus.toml"
 MODES = {
     "ours, marched": {},
-    "four marched legs": {"legs": 4},
-    "never marched": {"contrast": None},
+    "one marched leg": {"legs": 1},
+    "never marched": {"contrast": None, "bounded": None},
     "attenuated only": {"scattering": "attenuated"},
     "surface-only": {"scattering": "surface"},
 }
