@@ -11,7 +11,7 @@ from jaxvol.methods.impulse_response import estimate
 from jaxvol.methods.impulse_response.kit import Kit
 from jaxvol.methods.impulse_response.planning import Plan
 
-_PART = 4096  # receivers at a time
+_PART, _PATHS = 4096, 1 << 18  # receivers at a time, and paths: some seconds until a bake stops or is kept
 
 
 class Baked(NamedTuple):
@@ -45,8 +45,9 @@ def bake(
     `on_progress` gets the number of receivers that were finished. Raises `Interrupted` between parts once `stop` is set.
     """
     found = []
-    for number, first in enumerate(range(0, len(points), _PART)):
-        rows = slice(first, first + _PART)
+    size = min(_PART, max(256, _PATHS // samples))
+    for number, first in enumerate(range(0, len(points), size)):
+        rows = slice(first, first + size)
         label = f"{name}-{number}"
         done = None if parts is None else parts.get(label)
         if done is None:
@@ -61,13 +62,13 @@ def bake(
         found.append(done)
         if on_progress is not None:
             on_progress(len(done["variance"]))
-    size = np.array([len(part["variance"]) for part in found], np.float64)
+    weights = np.array([len(part["variance"]) for part in found], np.float64)
     once = np.array([part["surface_from_volume"].sum() for part in found], np.float64)
     dropped = np.array([float(part["occluded_share"]) for part in found])
     lost = once * dropped / np.maximum(1 - dropped, 1e-6)
     shares = {"occluded_share": float(lost.sum() / max(once.sum() + lost.sum(), 1e-30))}
     for name in ("marched_share", "beyond_share"):
-        shares[name] = float(np.average([float(part[name]) for part in found], weights=size))
+        shares[name] = float(np.average([float(part[name]) for part in found], weights=weights))
     return Baked(
         irradiance={layer: np.concatenate([part[layer] for part in found]) for layer in SURFACE},
         variance=np.concatenate([part["variance"] for part in found]),
