@@ -17,7 +17,7 @@ from jaxvol.methods.lattice_boltzmann.solver import solve
 from jaxvol.methods.lattice_boltzmann.sweeps import transport
 from jaxvol.types import Scene
 
-_EARLY = 1e-2  # relative residual of the lattice before its last correction
+_EARLY = 0.1  # relative residual of the lattice before its last correction, whose defect holds what is left
 
 
 class Unscattered(NamedTuple):
@@ -230,7 +230,7 @@ def march(
     rays: light_rays.LightRays,
     power: np.ndarray,
     seed: int,
-    blocks: Bool[Array, "X Y Z"] | None = None,
+    blocks: Bool[Array, "X Y Z"] | None,
 ) -> _Light:
     """Straight or bent, as planned; with anisotropic scattering every channel twice, with and without the forward part."""
     if plan.first_order:

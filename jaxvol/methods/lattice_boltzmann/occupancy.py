@@ -1,8 +1,8 @@
 """Where the grid holds anything: rays, of lights and of the eye, are walked from the first filled block to the last.
 
-Blocks of 4^3 voxels. A ray is looked at in the middle of pieces of at most two blocks; since every block beside a filled
-one counts as filled, no filled voxel is missed. Rays that meet none cost these looks, nothing else. Sweeps of the lattice
-run over all voxels of the box, filled or not: a recurrence along lines has no use for blocks, and the box is cropped.
+Blocks of 4^3 voxels. A ray is looked at in the middle of pieces of at most a block and a half; since every block beside a
+filled one counts as filled, no filled voxel and no neighbour of one is missed. Rays that meet none cost these looks only.
+Sweeps of the lattice run over all voxels of the (cropped) box: scattered light crosses the empty ones too.
 """
 
 import math
@@ -51,7 +51,7 @@ def narrowed(
     while count < len(t0):
         count *= 2
     pad = lambda x: jnp.asarray(np.concatenate([x, np.zeros((count - len(x), *x.shape[1:]))]), jnp.float32)  # noqa: E731
-    num = math.ceil(_EDGE * float(np.linalg.norm(blocks.shape)) / (2 * _EDGE))
+    num = math.ceil(float(np.linalg.norm(blocks.shape)) / 1.5)
     first, last = (np.asarray(x)[: len(t0)] for x in _spans(blocks, *(pad(x) for x in (position, direction, t0, t1)), num))
     piece = (t1 - t0) / num
     return np.where(t1 > t0, t0 + first * piece, t0), np.where(t1 > t0, t0 + (last + 1) * piece, t1)
