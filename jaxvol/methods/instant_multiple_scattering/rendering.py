@@ -32,7 +32,7 @@ from jaxvol.types import Camera, Estimate, Scene
 
 _PIXEL = sampling.stream("instant_multiple_scattering.pixel")
 _TRACED = "traced."  # before the names of lights from which some were chosen
-_BAND = 1 << 17  # pixels that are reconstructed at once
+_BAND = 1 << 16  # pixels that are reconstructed at once
 _TERMS = ("surface", "volume", "multiple")
 NAMES = tuple(f"{last}_from_{before}" for last in ("surface", "volume") for before in _TERMS)
 
@@ -228,6 +228,11 @@ def render_set(
     return _from_low_resolution(context, camera, result, counts)
 
 
+def _computed(plan):
+    """Names of the layers that are not zero in every pixel."""
+    return tuple(name for name in NAMES if (plan.volume if name.startswith("volume") else plan.surface))
+
+
 def _evaluate(context, camera, index, result):
     """All layers at the pixels `index`, tile by tile, into `result`."""
     size = min(context.plan.tile, light_paths.padded(index).size)
@@ -237,7 +242,7 @@ def _evaluate(context, camera, index, result):
         lanes[: len(chosen)] = chosen
         rays, weight = eye_rays.through_pixels(context, camera, jnp.asarray(lanes))
         values = gather_rays(context, *rays)
-        for name in NAMES:
+        for name in _computed(context.plan):
             result[name][chosen] = (np.asarray(values[name]) * weight)[: len(chosen)]
 
 
@@ -248,11 +253,12 @@ def _from_low_resolution(context, camera, result, counts):
     rows, columns = -(-camera.height // factor), -(-camera.width // factor)
     rays = eye_rays.block_rays(context, camera, rows, columns, factor=factor)
     shape = (rows * columns, 3)
-    coarse = {name: np.zeros(shape, np.float32) for name in NAMES}
+    names = _computed(plan)
+    coarse = {name: np.zeros(shape, np.float32) for name in names}
     for begin in range(0, shape[0], plan.tile):
         part = tuple(x[begin : begin + plan.tile] for x in rays)
         values = gather_rays(context, *part)
-        for name in NAMES:
+        for name in names:
             coarse[name][begin : begin + plan.tile] = np.asarray(values[name])
     steps = max(plan.eye_steps // 2, 1)
     low_guides = upsampling.guides(context.scene, *rays[:4], num_steps=steps)
@@ -266,7 +272,7 @@ def _from_low_resolution(context, camera, result, counts):
         guides = _with_mean_source(context, camera, guides, pixels.astype(jnp.uint32))
         options = {"height": camera.height, "width": camera.width, "factor": factor, "pixels": pixels}
         built, weight = upsampling.reconstruct(coarse, low_guides, guides, **options)
-        for name in NAMES:
+        for name in names:
             result[name][begin : begin + count] = np.asarray(built[name])[:count]
         seen = np.asarray(jnp.any(guides.source > 0, axis=-1) | guides.hits)
         refused.append(begin + np.flatnonzero(((np.asarray(weight) < plan.refine_below) & seen)[:count]))
@@ -320,12 +326,13 @@ def render(
     """
     counts: dict[str, int] = {}
     sizes: dict[str, int] | None = {} if plan.num_sets > 1 else None
+    names = _computed(plan)
     mean: dict[str, np.ndarray] = {}
-    squares = {name: np.float32(0.0) for name in NAMES}  # summed squared deviations from the mean (Welford 1962)
+    squares = {name: np.float32(0.0) for name in names}  # summed squared deviations from the mean (Welford 1962)
     for k in range(plan.num_sets):
         images, found = render_set(scene, camera, plan, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes)
         counts = {name: counts.get(name, 0) + value for name, value in found.items()}
-        for name in NAMES:
+        for name in names:
             before = mean.get(name, np.float32(0.0))
             mean[name] = images[name] if k == 0 else before + (images[name] - before) / (k + 1)
             if k > 0:
@@ -334,12 +341,14 @@ def render(
             on_progress((k + 1) / plan.num_sets)
     number = plan.num_sets
     shape = (camera.height, camera.width, 3)
+    black = dict.fromkeys(NAMES, jnp.zeros(shape, jnp.float32))  # one array for all layers that are zero
     variance = None
     if number > 1:
         scale = 1.0 / (number * (number - 1))
-        variance = layers.from_items({name: jnp.asarray((squares[name] * scale).reshape(shape)) for name in NAMES})
+        found = {name: jnp.asarray((squares[name] * scale).reshape(shape)) for name in names}
+        variance = layers.from_items(black | found)
     return Estimate(
-        mean=layers.from_items({name: jnp.asarray(image.reshape(shape)) for name, image in mean.items()}),
+        mean=layers.from_items(black | {name: jnp.asarray(mean[name].reshape(shape)) for name in names}),
         variance=variance,
         num_samples=jnp.float32(number) if number > 1 else None,
         diagnostics={name: jnp.asarray(value) for name, value in counts.items()},
