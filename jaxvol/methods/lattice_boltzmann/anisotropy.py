@@ -2,9 +2,9 @@
 
 The paper's Theta sends scattered light evenly into all links. Here Theta_ij = passing_i delta_ij + w_i beta_i k l_j beta_j
 sum_l (2l + 1) lambda_l P_l(u_i . u_j), the phase function by its Legendre moments up to `degree`. What is sharper goes
-straight on (delta-M, Wiscombe 1977): f = g^(degree + 1), sigma_s (1 - f), lambda_l = (g^l - f) / (1 - f). The 26 links
-integrate products of such moments exactly up to degree 3, so that columns sum to 1 - absorbed and the mean cosine is
-exact. Directions are eliminated as in sweeps.py; the state is (degree + 1)^2 moments of the fluence per voxel:
+straight on (delta-M, Wiscombe 1977): f = g^(degree + 1) for g > 0, sigma_s (1 - f), lambda_l = (g^l - f) / (1 - f). The
+26 links integrate products of such moments exactly up to degree 3, so that columns sum to 1 - absorbed and the mean cosine
+is exact. Directions are eliminated as in sweeps.py; the state is (degree + 1)^2 moments of the fluence per voxel:
 
     M = B (k Lambda M + S),  preconditioned BiCGStab (B between odd moments is not definite), lineax.
 
@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxvol.methods.lattice_boltzmann import preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import Lattice, ProbabilityMap, beta_gamma, link_class, link_length
+from jaxvol.methods.lattice_boltzmann.materials import forward_part
 from jaxvol.methods.lattice_boltzmann.sweeps import move_plane
 
 
@@ -60,11 +61,11 @@ def orders(degree: int) -> tuple[int, ...]:
 
 
 def eigenvalues(g: Float[Array, "..."], degree: int) -> list[Float[Array, "..."]]:
-    """lambda_l, l = 0..degree, of Henyey-Greenstein with the forward part f = g^(degree + 1) taken out."""
+    """lambda_l, l = 0..degree, of Henyey-Greenstein with its `forward_part` taken out."""
     powers = [jnp.ones_like(g)]
-    for _ in range(degree + 1):
+    for _ in range(degree):
         powers.append(powers[-1] * g)
-    f = powers.pop()
+    f = forward_part(g, degree)
     return [(p - f) / (1.0 - f) for p in powers]
 
 

@@ -1,7 +1,7 @@
 """Init pass (section III-A): the medium as numbers per voxel, and the smoothed refractive index with its gradient.
 
 Each voxel holds sigma * h per channel, weighted by how much of it each region fills; later inclusions override earlier
-ones. Of anisotropic scattering the forward part f = g^(degree + 1) is left to the ray, sigma_s' = (1 - f) sigma_s:
+ones. Of anisotropic scattering the forward part f (`forward_part`) is left to the ray, sigma_s' = (1 - f) sigma_s:
 similarity at degree 0, delta-M for a lattice that resolves moments up to `degree` (anisotropy.py). The index is
 n = 1 + sum of occupancy (n_m - n below), filtered once with a Gaussian, then differentiated, so that n and grad n stay
 consistent (the paper filters the gradient: linear, and equal in the interior). Stored is D = grad (n^2 / 2), per voxel
@@ -49,10 +49,22 @@ def regions(medium: Medium) -> tuple[Medium, ...]:
     return (medium, *medium.inclusions)
 
 
+def forward_part(g: Float[Array, "..."], degree: int) -> Float[Array, "..."]:
+    """f, the part of scattering that is left to the ray: g^(degree + 1), with the sign that it has.
+
+    None for negative g at odd degrees: scattering backwards is no forward peak, and moments less f would exceed 1 (g / (1 + g)
+    at degree 1), which makes light.
+    """
+    f = jnp.ones_like(g)
+    for _ in range(degree + 1):
+        f = f * g
+    return jnp.where(g < 0, 0.0, f) if degree % 2 else f
+
+
 def reduced_sigma(medium: Medium, *, degree: int = 0) -> tuple[Float[Array, "R 3"], Float[Array, "R 3"]]:
-    """sigma_s (1 - g^(degree + 1)) and sigma_a of every region at density 1, per unit length."""
+    """sigma_s (1 - f) and sigma_a of every region at density 1, per unit length."""
     parts = regions(medium)
-    scattering = jnp.stack([part.sigma_s * (1.0 - mean_cosine(part) ** (degree + 1)) for part in parts])
+    scattering = jnp.stack([part.sigma_s * (1.0 - forward_part(mean_cosine(part), degree)) for part in parts])
     return scattering, jnp.stack([part.sigma_a for part in parts])
 
 
@@ -172,7 +184,7 @@ def with_surfaces(materials: Materials, mesh: Mesh, *, num_channels: int) -> Mat
 
 def twice(materials: Materials, *, degree: int) -> Materials:
     """The channels as they are, and again with the forward part of scattering taken out of the ray (sigma_s whole)."""
-    whole = materials.scattering / (1.0 - materials.asymmetry ** (degree + 1))
+    whole = materials.scattering / (1.0 - forward_part(materials.asymmetry, degree))
     return eqx.tree_at(
         lambda m: (m.scattering, m.absorption),
         materials,

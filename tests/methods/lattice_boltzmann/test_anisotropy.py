@@ -9,7 +9,7 @@ import pytest
 from jaxvol import camera as cameras
 from jaxvol import direct
 from jaxvol.methods import lattice_boltzmann
-from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, preconditioner
+from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, materials, preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES, coefficients
 from jaxvol.methods.lattice_boltzmann.solver import solve
@@ -141,3 +141,13 @@ def test_plan_refuses_what_directions_cannot_do():
     with pytest.raises(ValueError, match="anisotropy = 'exact' must be one of"):
         lattice_boltzmann.plan(scene, None, resolution=8, anisotropy="exact")
     assert lattice_boltzmann.plan(_thin(0.0), None, resolution=8, anisotropy="directional").degree == 0
+
+
+def test_moments_of_scattering_never_exceed_one():
+    """Beyond one they make light: a forward part g^(degree + 1) of backward scattering gave -500 at g = -.999."""
+    g = jnp.linspace(-0.999, 0.999, 101)
+    for degree in range(4):
+        scales = jnp.stack(anisotropy.eigenvalues(g, degree))
+        assert float(jnp.max(jnp.abs(scales))) <= 1 + 1e-5
+        part = materials.forward_part(g, degree)
+        assert np.allclose((1 - part) * scales + part, [g**l for l in range(degree + 1)], atol=1e-5)
