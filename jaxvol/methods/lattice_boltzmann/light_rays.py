@@ -97,8 +97,10 @@ def _parallel(direction, irradiance, low, high, spacing, back):
     nu, nv = (max(int(np.ceil((c.max() - c.min()) / spacing)), 1) for c in (u, v))
     du, dv = (u.max() - u.min()) / nu, (v.max() - v.min()) / nv
     i, j = (a.ravel() for a in np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij"))
-    # the middle of each square: at random places in them voxels get more and less light (30 times the squared error)
-    across = (u.min() + (i + 0.5) * du)[:, None] * s + (v.min() + (j + 0.5) * dv)[:, None] * t
+    # even rows, each shifted by the golden ratio: at random places in their squares rays give voxels more and less light (30
+    # times the squared error), and without shifts they meet the voxels of an axis-parallel grid at the same few places
+    shift = (0.5 + (math.sqrt(5.0) - 1.0) / 2.0 * i) % 1.0
+    across = (u.min() + (i + 0.5) * du)[:, None] * s + (v.min() + (j + shift) * dv)[:, None] * t
     origin = across + (w.min() - back) * direction
     return origin, np.broadcast_to(direction, origin.shape), np.broadcast_to(irradiance * du * dv, origin.shape)
 

@@ -100,11 +100,13 @@ def test_thin_media_scatter_by_the_exact_phase_function(anisotropy):
 
 @pytest.mark.slow
 def test_reflectance_of_a_slab_that_scatters_forwards():
-    """T4: g = 0.75, thickness 2, albedo 1, light along the normal: R = 0.163176; similarity gives 0.203."""
+    """T4: g = 0.75, thickness 2, albedo 1, light along the normal: R = 0.163176; similarity .203, moments of degree 1 .177."""
     tau, width, count = 2.0, 20.0, 8
     medium = Medium(jnp.asarray([[0, 0, 0], [width, width, tau]], jnp.float32), jnp.ones(3), jnp.zeros(3), jnp.float32(0.75))
     scene = Scene(medium=medium, directional_lights=DirectionalLights(jnp.asarray([[0.0, 0, 1]]), jnp.ones((1, 3))))
-    plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), rays_per_voxel=1.0, view_step=0.25)
+    plan = lattice_boltzmann.plan(
+        scene, None, resolution=round(width * count / tau), rays_per_voxel=1.0, view_step=0.25, degree=2
+    )
     light = lattice_boltzmann.illuminate(scene, plan)
     assert bool(light.diagnostics["converged"])
     nodes, weights = np.polynomial.legendre.leggauss(12)
@@ -115,7 +117,7 @@ def test_reflectance_of_a_slab_that_scatters_forwards():
     rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (origin, up, np.full(len(mu), np.inf))))
     (radiance,) = (v[:, 0] for v in lattice_boltzmann.radiance(scene, rays, plan, light).values())
     reflectance = float(np.sum(radiance * np.repeat(0.5 * weights, 8) * mu) * 2 * np.pi / 8)
-    assert reflectance == pytest.approx(0.163176, rel=0.06)
+    assert reflectance == pytest.approx(0.163176, rel=0.02)
 
 
 def test_corrections_along_many_directions_agree_where_nothing_is_left_to_correct():

@@ -88,7 +88,7 @@ def test_refraction_with_anisotropic_scattering_against_photons():
     sigma_s, sigma_a, ior, g = 15.2, 0.8, 1.3, 0.6
     books, exact = module.photon_tracer(sigma_s, sigma_a, ior, 200_000, g=g)
     assert sum(books.values()) == pytest.approx(1.0, abs=1e-9)
-    absorbed, shells = module.lattice_books(sigma_s, sigma_a, ior, 32, g=g)
+    absorbed, shells = module.lattice_books(sigma_s, sigma_a, ior, 40, g=g)
     assert absorbed == pytest.approx(books["absorbed"], rel=0.04)
     assert np.abs(shells - exact).sum() / exact.sum() < 0.1
 
