@@ -97,9 +97,9 @@ def exact_pairs(
 
 @partial(jax.jit, static_argnames=("phase_kind",))
 def _scatter(medium, direction, u1, u2, *, phase_kind):
-    """Directions towards which to look for light that scatters into the eye: the phase function is symmetric."""
-    found, _ = phase.sample(medium, -direction, u1, u2)
-    return found
+    """Directions towards which to look for light that scatters into the eye: against its travel (phase is symmetric)."""
+    arriving, _ = phase.sample(medium, -direction, u1, u2)
+    return -arriving
 
 
 @jax.jit
