@@ -8,9 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxvol import media, phase, transmittance
+from jaxvol import extinction, interval_map, media, phase, transmittance
+from jaxvol.direct import cells
 from jaxvol.layers import items
 from jaxvol.methods.deep_screen_space import kernel
+from jaxvol.methods.path_tracing import flight
 from jaxvol.scene import make_scene
 from jaxvol.stress import checks, driver, extremes, scenes
 from jaxvol.types import Layers, Medium
@@ -204,3 +206,54 @@ def test_layers_of_an_empty_scene_are_sound():
     config = dict(extremes.extremes())["no light"]
     for name, image in items(checks.render(config, "direct")):
         assert float(np.abs(np.asarray(image)).max()) == 0.0, name
+
+
+def of_direct(medium):
+    """Weights of nodes on an eye ray, `direct`."""
+    marching = extinction.marching_medium(medium)
+    borders = jnp.linspace(1.0, 3.0, 17)[:, None]
+    cut = cells.build(marching, *RAY, borders, None)
+    return jnp.sum(cells.place(marching, cut, jnp.linspace(0.05, 0.95, 8)[:, None]).weight)
+
+
+def of_intervals(medium):
+    """Weights and places of samples in drops of transmittance, `deep_screen_space`."""
+    found = interval_map.interval_map(medium, *RAY, jnp.ones(1), jnp.full(1, 3.0), num_intervals=4, num_steps=16)
+    return jnp.sum(found.weight * found.distance[:, None])
+
+
+def of_flights(medium):
+    """Weights of free flights, `path_tracing`."""
+    medium = eqx.tree_at(lambda m: m.density, medium, None, is_leaf=lambda x: x is None)
+    u = jnp.linspace(0.05, 0.95, 8)
+    spans = jnp.tile(jnp.asarray([[1.0, 3.0]]), (8, 1)), jnp.zeros((8, 1), jnp.int32)
+    return jnp.sum(flight.sample_homogeneous(medium, spans, jnp.ones((8, 3)), u, u[::-1])[4])
+
+
+RAY = jnp.asarray([[-2.0, 0.1, 0.2]]), jnp.asarray([[1.0, 0.0, 0.0]])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", [of_direct, of_intervals, of_flights])
+def test_float32_is_float64_with_gradients_in_every_parameter(stage):
+    """Optical depth 1e-6 to 1e3 through a grid of contrast 1e4: values and slopes by sigma_s, sigma_a and every voxel."""
+    density = 10.0 ** (-4.0 * np.random.default_rng(3).random((3, 3, 3)))
+
+    def value(told):
+        bounds = jnp.asarray([[-1.0] * 3, [1.0] * 3])
+        return stage(Medium(bounds, told["sigma_s"], told["sigma_a"], jnp.float32(0.3), told["density"], None))
+
+    def with_slopes(told, kind):
+        return jax.jit(jax.value_and_grad(value))(jax.tree.map(lambda x: jnp.asarray(x, kind), told))
+
+    for tau in (1e-6, 1.0, 1e3):
+        told = {"sigma_s": tau * np.array([0.5, 0.3, 0.4]), "sigma_a": tau * np.array([0.1, 0.2, 0.4]), "density": density}
+        found, slopes = with_slopes(told, jnp.float32)
+        with jax.enable_x64(True):
+            exact, right = jax.device_get(with_slopes(told, jnp.float64))
+        assert float(found) == pytest.approx(float(exact), rel=2e-3)
+        for name, slope in slopes.items():
+            assert np.isfinite(slope).all(), (tau, name)
+            # What a relative change of the parameter does, to a hundred roundings of the value.
+            parts = (np.asarray(x, np.float64) * np.asarray(told[name]) for x in (slope, right[name]))
+            np.testing.assert_allclose(*parts, rtol=2e-2, atol=1e-5 * abs(float(exact)), err_msg=f"{name} at {tau}")
