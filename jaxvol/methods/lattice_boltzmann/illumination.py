@@ -5,11 +5,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, fresnel, light_rays, marching, occupancy, preconditioner
 from jaxvol.methods.lattice_boltzmann import materials as material_pass
-from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice, shift
+from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice, mean_through, shift
 from jaxvol.methods.lattice_boltzmann.materials import Materials
 from jaxvol.methods.lattice_boltzmann.planning import Plan
 from jaxvol.methods.lattice_boltzmann.refraction import body_entry
@@ -250,7 +251,18 @@ def march(
         return _Light(found.track, *books, found.num_steps, None, None)
     direction = found.flow / jnp.maximum(jnp.mean(found.track, axis=0), 1e-20)
     part, whole = found.track[:num], found.track[num:]
+    whole = whole * _beside_denser(materials.scattering[num:] + materials.absorption[num:])
     return _Light(part, *books, found.num_steps, direction * jnp.mean(part, axis=0), Unscattered(whole, direction))
+
+
+def _beside_denser(extinction):
+    """Track in voxels as dense as their densest neighbour, over track in them as they are.
+
+    Unscattered light ends in a thin layer of dense voxels. Where a voxel is filled in part, or thinner, its track is larger
+    by as much, and interpolated into its neighbour it would make light.
+    """
+    densest = lax.reduce_window(extinction, 0.0, lax.max, (1, 3, 3, 3), (1, 1, 1, 1), "SAME")
+    return mean_through(densest) / mean_through(extinction)
 
 
 def _channels(power, num_channels):

@@ -202,3 +202,9 @@ def theta(lattice: Lattice, scattering: float, absorption: float, *, kind: Proba
     multiple = 1.0 / (1.0 - scattering * np.sum(weights * lengths * gamma))  # scattered again before it left the voxel
     scattered = np.outer(weights * beta, scattering * lengths * beta) * multiple
     return scattered + np.diag(1.0 - (scattering + absorption) * lengths * beta)
+
+
+def mean_through(thickness: Float[Array, "..."]) -> Float[Array, "..."]:
+    """(1 - exp(-x)) / x: mean transmittance inside a step of optical thickness x."""
+    thin, series = thickness < 1e-4, 1.0 - 0.5 * thickness
+    return jnp.where(thin, series, -jnp.expm1(-thickness) / jnp.where(thin, 1.0, thickness))

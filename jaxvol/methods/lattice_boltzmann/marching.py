@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxvol.methods.lattice_boltzmann.lattice import mean_through
 from jaxvol.methods.lattice_boltzmann.materials import Materials
 from jaxvol.methods.lattice_boltzmann.occupancy import narrowed, to_voxels
 
@@ -165,12 +166,9 @@ def _absorb(extinction, track, power, at, length, heading):
     new_power, new_track, total = [], [], 0.0
     for sigma, field, amount in zip(extinction, track, power, strict=False):
         thickness = sigma[at] * length
-        lost = -jnp.expm1(-thickness)
-        thin = thickness < 1e-4
-        mean = jnp.where(thin, 1.0 - 0.5 * thickness, lost / jnp.where(thin, 1.0, thickness))
-        deposited = amount * mean * length
+        deposited = amount * mean_through(thickness) * length
         new_track.append(field.at[at].add(deposited))
-        new_power.append(amount - amount * lost)
+        new_power.append(amount + amount * jnp.expm1(-thickness))
         total = total + deposited * (1.0 / len(extinction))
     for field, component in zip(track[len(extinction) :], heading, strict=False):
         new_track.append(field.at[at].add(total * component))

@@ -24,8 +24,9 @@ from jaxtyping import Array, Bool, Float
 
 from jaxvol import extinction, phase, segments
 from jaxvol.methods.lattice_boltzmann.anisotropy import eigenvalues, mean_direction
+from jaxvol.methods.lattice_boltzmann.lattice import mean_through
 from jaxvol.methods.lattice_boltzmann.marching import STEPS, bent_table, corner_table, enters, interpolate
-from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials, mean_cosine, reduced_sigma, regions
+from jaxvol.methods.lattice_boltzmann.materials import Grid, Materials, forward_part, mean_cosine, reduced_sigma, regions
 from jaxvol.methods.lattice_boltzmann.occupancy import narrowed, to_voxels
 from jaxvol.types import Medium
 
@@ -208,7 +209,7 @@ def _straight(marching, parts, grid, table, layout, degree, scattering, absorpti
                 hard = _truncated(mean_cosine(part), *angles, degree)[..., None] * scattering[number]
                 once = once + column[:, None, None] * _once(first, exact, hard)
         emitted = scattered[:, None, :] * fluence + once
-        seen = (through * _mean_through(thickness) / (4.0 * math.pi))[:, None, :]
+        seen = (through * mean_through(thickness) / (4.0 * math.pi))[:, None, :]
         return radiance + seen * emitted, through * jnp.exp(-thickness)
 
     n = origin.shape[0]
@@ -223,12 +224,6 @@ def _straight(marching, parts, grid, table, layout, degree, scattering, absorpti
         return i + _CHECK, lax.fori_loop(i, i + _CHECK, body, state)
 
     return lax.while_loop(unfinished, advance, (0, begin))[1]
-
-
-def _mean_through(thickness):
-    """(1 - exp(-x)) / x: mean transmittance inside a step of optical thickness x."""
-    thin = thickness < 1e-4
-    return jnp.where(thin, 1.0 - 0.5 * thickness, -jnp.expm1(-thickness) / jnp.where(thin, 1.0, thickness))
 
 
 def gather_bent(
@@ -302,10 +297,10 @@ def _bent(table, shape, layout, degree, step, integrator, solid, position, headi
         emitted = scattered[:, None, :] * fluence
         if first is not None:
             g = row[:, columns - 1 : columns]
-            exact = 4.0 * math.pi * phase.henyey_greenstein(first[2], g * first[3]) / (1.0 - g ** (degree + 1))
+            exact = 4.0 * math.pi * phase.henyey_greenstein(first[2], g * first[3]) / (1.0 - forward_part(g, degree))
             hard = _truncated(g, *first[2:], degree)
             emitted = emitted + scattered[:, None, :] * _once(first, exact[..., None], hard[..., None])
-        seen = through * _mean_through(thickness) / (4.0 * math.pi * (n * n)[:, None])
+        seen = through * mean_through(thickness) / (4.0 * math.pi * (n * n)[:, None])
         on = moving[:, None]
         radiance = radiance + jnp.where(on, seen, 0.0)[:, None, :] * emitted
         through = jnp.where(on, through * jnp.exp(-thickness), through)
