@@ -9,7 +9,7 @@ import pytest
 from jaxvol import camera as cameras
 from jaxvol import direct
 from jaxvol.methods import lattice_boltzmann
-from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, materials, preconditioner
+from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, illumination, materials, preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES, coefficients
 from jaxvol.methods.lattice_boltzmann.solver import solve
@@ -153,3 +153,12 @@ def test_moments_of_scattering_never_exceed_one():
         assert float(jnp.max(jnp.abs(scales))) <= 1 + 1e-5
         part = materials.forward_part(g, degree)
         assert np.allclose((1 - part) * scales + part, [g**l for l in range(degree + 1)], atol=1e-5)
+
+
+def test_track_beside_denser_voxels():
+    """A voxel filled by a tenth holds ten times the track where it is dense, and as much as the others where all is thin."""
+    share = jnp.ones((1, 4, 4, 4)).at[:, 0].set(0.1)
+    for density, expected in ((1e3, 0.1), (1e-3, 1.0)):
+        found = illumination._beside_denser(density * share)
+        np.testing.assert_allclose(found[0, 0], expected, rtol=2e-3)
+        np.testing.assert_allclose(found[0, 1:], 1.0, rtol=1e-6)
