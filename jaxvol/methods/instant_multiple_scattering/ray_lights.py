@@ -113,7 +113,8 @@ def sample_on_flight(
     a, e = pairs.dot(along, offset), pairs.dot(direction, offset)
     closest = (a - cosine * e) / sine2
     aside = pairs.combine(pairs.combine(offset, -closest, along), (cosine * a - e) / sine2, direction)
-    h = jnp.sqrt(jnp.maximum(pairs.dot(aside, aside), pairs.least_distance2(length)))
+    least = jnp.maximum(pairs.least_distance2(length), 1e-24)  # rows that only fill up have length 0
+    h = jnp.sqrt(jnp.maximum(pairs.dot(aside, aside), least))
     scale = jnp.sqrt(sine2) / h
     low, high = _asinh(-closest * scale), _asinh((length - closest) * scale)
     y = low + u * (high - low)

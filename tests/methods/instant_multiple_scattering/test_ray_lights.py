@@ -36,6 +36,15 @@ def test_points_on_a_flight_have_their_pdf(start):
     assert values.max() < 1.05 * values.min()  # the pdf is that kernel: every sample has the same weight
 
 
+def test_a_row_that_only_fills_up_is_no_nan():
+    """Its length and direction are 0, and it may lie on the eye ray: 0 times what it sends must be 0."""
+    nothing = vector(0, 0, 0)
+    v, inverse = ray_lights.sample_on_flight(
+        jnp.float32(0.5), vector(-3, 0, 0), vector(1, 0, 0), nothing, nothing, jnp.float32(0)
+    )
+    assert float(v) == 0 and np.isfinite(inverse)
+
+
 @pytest.mark.slow
 def test_infinite_medium():
     """The same exact radiance that the virtual points are tested with; no clamping, no compensation."""
