@@ -150,7 +150,7 @@ def slab_radiance():
                 scene, None, corrections=corrections, resolution=round(width * count / tau), rays_per_voxel=1.0, view_step=0.25
             )
             light = lattice_boltzmann.illuminate(scene, plan)
-            up, down = (_exitance(scene, plan, light, tau, width, side) for side in (0, 1))
+            up, down = (exitance(scene, plan, light, tau, width, side) for side in (0, 1))
             down += np.exp(-tau / mu0)
             rows.append({
                 "case": f"slab tau {tau:g} mu0 {mu0:g}", "corrections": corrections, "resolution": count,
@@ -159,7 +159,8 @@ def slab_radiance():
     return rows
 
 
-def _exitance(scene, plan, light, tau, width, side):
+def exitance(scene, plan, light, tau, width, side):
+    """Irradiance that leaves the middle of a slab's face, by quadrature over the hemisphere of radiance."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     mu, phi = 0.5 * (nodes + 1), (np.arange(8) + 0.5) / 8 * 2 * np.pi
     mu, phi = (a.ravel() for a in np.meshgrid(mu, phi, indexing="ij"))

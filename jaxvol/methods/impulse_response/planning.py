@@ -166,6 +166,7 @@ def plan(
     if march_all:
         heterogeneous = False
         legs = legs or int(np.clip(2 * np.ceil(across), 2, _MOST_LEGS))
+        skipped.append(f"no tables for the receivers' own segments: the medium is {across:.2g} mean free paths thick")
     elif scatters and not heterogeneous:
         skipped.append("no density varies along segments: none is marched for its contrast")
     if not (scatters and back_scattering):
@@ -220,7 +221,7 @@ def _probe_sigma(mesh: Mesh, medium: Medium | None) -> float:
     extent = float(np.ptp(np.asarray(mesh.vertices, np.float64), axis=0).max())
     sigma = np.asarray(media.sigma_t(medium), np.float64)
     density = 1.0 if medium.density is None else float(np.mean(np.asarray(medium.density)))
-    return float(np.float32(max(density * sigma[sigma > 0].min(), 1 / extent)))
+    return float(np.float32(max(density * sigma[sigma > 0].min(), 1 / extent if extent > 0 else 1.0)))
 
 
 def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTables | None = None) -> Kit:

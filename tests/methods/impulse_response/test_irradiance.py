@@ -212,6 +212,9 @@ def test_bad_input():
     bent = Medium(scene.medium.bounds, scene.medium.sigma_s, scene.medium.sigma_a, scene.medium.g, ior=jnp.float32(1.3))
     with pytest.raises(ValueError, match="refractive_index"):
         impulse_response.plan(open_plane(0.9, medium=bent), None)
+    point = Mesh(jnp.zeros((3, 3)), jnp.array([[0, 1, 2]]), jnp.zeros((1, 3)))
+    with pytest.raises(ValueError, match="no face has an area"):
+        impulse_response.irradiance(open_plane(0.9, mesh=point), *receivers())
     with pytest.raises(ValueError, match="samples"):
         impulse_response.irradiance(scene, *receivers(), samples=0)
     with pytest.raises(ValueError, match="shape"):

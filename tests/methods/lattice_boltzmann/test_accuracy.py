@@ -45,19 +45,6 @@ def test_emission_density_of_a_slab_against_the_integral_equation():
     assert row["error"] < 0.05
 
 
-def _exitance(scene, plan, light, tau, width, side):
-    """Irradiance that leaves the middle of a slab's face, by quadrature over the hemisphere of radiance."""
-    nodes, weights = np.polynomial.legendre.leggauss(12)
-    mu, phi = (a.ravel() for a in np.meshgrid(0.5 * (nodes + 1), (np.arange(8) + 0.5) / 4 * np.pi, indexing="ij"))
-    weight = np.repeat(0.5 * weights, 8) * mu * 2 * np.pi / 8
-    r = np.sqrt(1 - mu * mu)
-    direction = np.stack([r * np.cos(phi), r * np.sin(phi), mu if side == 0 else -mu], 1)
-    origin = np.array([width / 2, width / 2, 0.0 if side == 0 else tau]) - 1e-3 * direction
-    rays = Rays(*(jnp.asarray(x, jnp.float32) for x in (origin, direction, np.full(len(mu), np.inf))))
-    found = lattice_boltzmann.radiance(scene, rays, plan, light)
-    return float(sum((v[:, 0] * weight).sum() for v in found.values()))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("tau", "mu0", "reflectance", "count", "width"),
@@ -75,7 +62,7 @@ def test_slab_reflectance_and_transmittance(tau, mu0, reflectance, count, width)
     scene = Scene(medium=medium, directional_lights=sun)
     plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), rays_per_voxel=1.0, view_step=0.25)
     light = lattice_boltzmann.illuminate(scene, plan)
-    up, down = (_exitance(scene, plan, light, tau, width, side) for side in (0, 1))
+    up, down = (experiment("lattice_accuracy").exitance(scene, plan, light, tau, width, side) for side in (0, 1))
     assert up == pytest.approx(reflectance, rel=0.03)
     assert down + np.exp(-tau / mu0) == pytest.approx(1 - reflectance, rel=0.03)
 
@@ -98,8 +85,8 @@ def diffusely_lit_slab():
     plan = lattice_boltzmann.plan(scene, None, resolution=round(width * count / tau), **options)
     light = lattice_boltzmann.illuminate(scene, plan)
     straight = float(np.sum(flux * np.exp(-tau / mu)))
-    down = _exitance(scene, plan, light, tau, width, 1) + straight
-    return down, _exitance(scene, plan, light, tau, width, 0)
+    down = experiment("lattice_accuracy").exitance(scene, plan, light, tau, width, 1) + straight
+    return down, experiment("lattice_accuracy").exitance(scene, plan, light, tau, width, 0)
 
 
 @pytest.mark.slow
