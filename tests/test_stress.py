@@ -64,6 +64,22 @@ def test_checks_find_what_they_look_for():
     assert "not finite" in checks.sound(Layers(emission=jnp.full((2, 2, 3), jnp.nan)))
     assert "least value -1" in checks.sound(Layers(emission=-jnp.ones((2, 2, 3))))
     assert checks.differs(np.ones(4), np.ones(4)) is None and "0.1" in checks.differs(np.ones(4), np.full(4, 0.9))
+    faint = 1e-28 * np.ones(4), 2e-28 * np.ones(4)
+    assert "0.5" in checks.differs(*faint) and checks.differs(*faint, dark=1e-27) is None
+    assert "0.5" in checks.differs(*faint, dark=1.5e-28)  # one of them is not dark
+
+
+def test_pictures_are_dark_against_their_own_light():
+    """Brightness is linear in light, the same in any unit, and that of the brightest light."""
+    for number in range(len(scenes.CLASSES)):
+        _, config = scenes.random_scene(number)
+        bright = checks.brightest(config)
+        assert bright > 0
+        assert checks.brightest(scenes.with_light(config, 4.0)) == pytest.approx(4 * bright)
+        assert checks.brightest(scenes.in_units(config, 2.0**17)) == pytest.approx(bright)
+    lamp = {"camera": {"origin": [0, 0, 2], "target": [0, 0, 0]}, "shapes": [], "lights": []}
+    assert checks.brightest(lamp) == 0.0
+    assert checks.brightest(lamp | {"lights": [{"intensity": [1, 8, 2]}, {"radiance": [1, 1, 1]}]}) == 2.0
 
 
 @pytest.mark.parametrize(
@@ -113,6 +129,23 @@ def test_a_stopped_run_goes_on(tmp_path, monkeypatch):
     again = driver.run(tmp_path, first=0, num=5, methods=("direct",))
     assert len(again) == len(first) + 2 == len(calls)
     assert "direct" in driver.table(again) and not driver.failures(again)
+
+
+def test_scenes_are_drawn_until_enough_are_taken(tmp_path, monkeypatch):
+    """Two of five classes refused: 30 are taken all the same, apart from the refused; a method that takes none ends."""
+    monkeypatch.setattr(driver, "extreme_cases", list)
+
+    def run_case(config, number, name, method):
+        if method == "impulse_response" and number % 5 < 2 or method == "lattice_boltzmann":
+            return {"refused": "no"}
+        return {"failed": [], "passed": ["sound"], "seconds": 0.0}
+
+    monkeypatch.setattr(driver, "run_case", run_case)
+    for method, most in (("direct", 30), ("impulse_response", 60), ("lattice_boltzmann", 120)):
+        found = driver.run(tmp_path, first=7, num=30, methods=(method,))
+        taken = sum("refused" not in r for r in found)
+        assert taken >= 30 if method != "lattice_boltzmann" else taken == 0 and len(found) == 4 * 30
+        assert [r["case"] for r in found] == [f"random {k}" for k in range(7, 7 + len(found))] and len(found) <= most
 
 
 @pytest.mark.parametrize("method", ("direct", "deep_screen_space"))

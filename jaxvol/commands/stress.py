@@ -10,7 +10,7 @@ from jaxvol.stress import checks, driver
 
 
 def stress(
-    scenes: Annotated[int, typer.Option(help="Random scenes, besides the extremes.", min=0)] = 500,
+    scenes: Annotated[int, typer.Option(help="Random scenes that each method shall take, besides the extremes.", min=0)] = 500,
     first: Annotated[int, typer.Option(help="Number of the first random scene.", min=0)] = 0,
     methods: Annotated[list[str] | None, typer.Option("--method", help="Method; may be repeated. Default: all.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for results; one that holds some goes on.")] = Path("out/stress"),

@@ -28,6 +28,7 @@ METHODS = (*OPTIONS, "auto")
 SAME = 2e-3  # relative L1 between pictures that may differ by rounding only
 POWER = 4.0  # of light; a power of two, so that rounding stays the same
 UNIT = 2.0**17  # of length, or its inverse
+DARK = float(np.sqrt(np.finfo(np.float32).tiny))  # 1.1e-19 of the light: products of two such numbers underflow
 FURNACE = 0.02  # above 1 by which a picture in a furnace may lie, beyond three standard errors
 FAR_TOO_BRIGHT = 1.5
 BATCHES = 4
@@ -69,8 +70,10 @@ def sound(layers: Layers) -> str | None:
     return None
 
 
-def differs(a: np.ndarray, b: np.ndarray) -> str | None:
-    """Whether two pictures differ by more than rounding; None where they do not."""
+def differs(a: np.ndarray, b: np.ndarray, *, dark: float = 0.0) -> str | None:
+    """Whether two pictures differ by more than rounding; None where they do not, or where both are nowhere above `dark`."""
+    if max(a.max(), b.max()) <= dark:
+        return None
     scale = max(np.abs(a).sum(), np.abs(b).sum())
     difference = np.abs(a - b).sum() / scale if scale > 0 else 0.0
     return None if difference <= SAME else f"relative difference {difference:.3g}"
@@ -83,8 +86,12 @@ def linear(config: scenes.Config, method: str, base: np.ndarray) -> str | None:
 
 
 def unit_free(config: scenes.Config, method: str, base: np.ndarray, *, factor: float) -> str | None:
-    """Other units of length give the same picture, with the same random numbers."""
-    found = differs(picture(render(scenes.in_units(config, factor), method)), base)
+    """Other units of length give the same picture, with the same random numbers.
+
+    Pictures darker than the square root of float32's smallest normal number, relative to the scene's light, are black:
+    they are products of factors that have a unit (a flux and an inverse area), and underflow in one unit but not in another.
+    """
+    found = differs(picture(render(scenes.in_units(config, factor), method)), base, dark=DARK * brightest(config))
     return found and f"lengths x {factor:.3g}: {found}"
 
 
@@ -116,6 +123,15 @@ def furnace(config: scenes.Config, method: str) -> str | None:
 def size(config: scenes.Config) -> float:
     """How far the camera stands from what it looks at: the scene's unit of length, about."""
     return float(np.linalg.norm(np.subtract(config["camera"]["origin"], config["camera"]["target"])))
+
+
+def brightest(config: scenes.Config) -> float:
+    """The largest radiance or irradiance of any light; of a point's intensity at the distance `size`."""
+    found = [np.max(shape.get("emission", 0.0)) for shape in config["shapes"]]
+    for light in config["lights"]:
+        found.append(np.max(light["intensity"]) / size(config) ** 2 if "intensity" in light else 0.0)
+        found += [np.max(light[key]) for key in ("irradiance", "radiance") if key in light]
+    return float(max(found, default=0.0))
 
 
 def clear_caches() -> None:

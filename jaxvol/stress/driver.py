@@ -1,8 +1,8 @@
 """Run cases through methods, keep what was found (stress.jsonl), go on where it was stopped."""
 
 import json
+import math
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,25 @@ from jaxvol.stress import checks, extremes, scenes
 RESULTS = "stress.jsonl"
 # Of each class every second scene in other units, every tenth turned.
 _EVERY_UNITS, _EVERY_TURN = 2, 10
+_MOST_DRAWS = 4  # random scenes a method is offered, for each that it shall take
 
 Record = dict[str, Any]
+Case = tuple[str, str, int | None, scenes.Config]  # key, class, number or None for extremes, scene
 
 
-def cases(first: int, num: int) -> Iterator[tuple[str, str, int | None, scenes.Config]]:
-    """(key, class, number or None for extremes, scene) of the extremes and of random scenes first .. first + num - 1."""
-    for name, config in extremes.extremes():
-        yield f"extreme: {name}", "extreme", None, config
-    for number in range(first, first + num):
-        name, config = scenes.random_scene(number)
-        yield f"random {number}", name, number, config
+def cases(first: int, num: int) -> list[Case]:
+    """(key, class, number, scene) of the random scenes first .. first + num - 1."""
+    return [(f"random {k}", *_numbered(k)) for k in range(first, first + num)]
+
+
+def _numbered(number: int) -> tuple[str, int, scenes.Config]:
+    name, config = scenes.random_scene(number)
+    return name, number, config
+
+
+def extreme_cases() -> list[Case]:
+    """(key, "extreme", None, scene) of all extremes."""
+    return [(f"extreme: {name}", "extreme", None, config) for name, config in extremes.extremes()]
 
 
 def run_case(config: scenes.Config, number: int | None, name: str, method: str) -> Record:
@@ -65,31 +73,60 @@ def run_case(config: scenes.Config, number: int | None, name: str, method: str) 
 def run(
     out: Path, *, first: int, num: int, methods: tuple[str, ...], stop: jobs.Stop | None = None, again: bool = False
 ) -> list[Record]:
-    """All cases by all methods; those that `out` holds are taken from there, failed ones run again with `again`."""
+    """The extremes and, from scene number `first` on, random scenes by all methods, until each has taken `num` of them.
+
+    Scenes that a method refuses count apart; after `_MOST_DRAWS` times `num` scenes a method is done all the same. Cases
+    that `out` holds are taken from there, failed ones run again with `again`.
+    """
     out.mkdir(parents=True, exist_ok=True)
     path = out / RESULTS
     done = _read(path)
-    wanted = [(key, name, number, config, m) for key, name, number, config in cases(first, num) for m in methods]
     if again:
         done = {k: r for k, r in done.items() if not r.get("failed")}
-    # Method by method and class by class, so that compiled programs are used again before they are dropped.
-    todo = sorted((w for w in wanted if (w[0], w[4]) not in done), key=lambda w: (w[4], w[1] != "extreme", w[1]))
-    with jobs.progress("stress", total=len(wanted)) as advance:
-        advance(len(wanted) - len(todo))
-        before = None
-        for count, (key, name, number, config, method) in enumerate(todo, start=1):
+    records = []
+    for method in methods:
+        wanted, drawn, short = extreme_cases(), 0, num
+        while True:
+            _run_cases(path, done, wanted, method, stop)
+            mine = [done[case[0], method] for case in wanted if (case[0], method) in done]
+            records += mine
+            if stop:
+                return records
+            short -= sum(r["class"] != "extreme" and "refused" not in r for r in mine)
+            wanted = cases(first + drawn, _next_draw(num, drawn, short))
+            if not wanted:
+                break
+            drawn += len(wanted)
+    return records
+
+
+def _next_draw(num: int, drawn: int, short: int) -> int:
+    """How many scenes more give `short` that are taken, about, if as large a share is taken as of those drawn before."""
+    if short <= 0:
+        return 0
+    taken = max(num - short, 1) / drawn if drawn else 1.0
+    return min(math.ceil(short / taken), _MOST_DRAWS * num - drawn)
+
+
+def _run_cases(
+    path: Path, done: dict[tuple[str, str], Record], wanted: list[Case], method: str, stop: jobs.Stop | None
+) -> None:
+    """Those of the cases that are not in `done` by one method, into `done` and the file."""
+    # Class by class, so that compiled programs are used again before they are dropped.
+    todo = sorted((case for case in wanted if (case[0], method) not in done), key=lambda case: case[1])
+    before = None
+    with jobs.progress(f"stress, {method}", total=len(todo)) as advance:
+        for count, (key, name, number, config) in enumerate(todo, start=1):
             if stop:
                 break
-            if before not in (None, (method, name)):
+            if name != before:
                 checks.clear_caches()  # the next class has other shapes, and hundreds of programs would fill the memory
-            before = method, name
-            record = {"case": key, "class": name, "method": method} | run_case(config, number, name, method)
-            done[key, method] = record
-            advance(1, note=f"{method}, {key}")
-            if count % 20 == 0 or count == len(todo):
+            before = name
+            done[key, method] = {"case": key, "class": name, "method": method} | run_case(config, number, name, method)
+            advance(1, note=key)
+            if count % 20 == 0:
                 _write(path, done)
     _write(path, done)
-    return [done[w[0], w[4]] for w in wanted if (w[0], w[4]) in done]
 
 
 def _read(path: Path) -> dict[tuple[str, str], Record]:
