@@ -102,8 +102,13 @@ def transform(
     vertices = (triangles.vertices * np.asarray(scale)) @ turn.T + np.asarray(translate)
     if not (np.abs(vertices) <= LARGEST_LENGTH).all():
         raise ValueError(f"transform takes vertices beyond {LARGEST_LENGTH:g}")
-    faces = triangles.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else triangles.faces
-    return replace(triangles, vertices=vertices, faces=faces)
+    moved = replace(triangles, vertices=vertices)
+    return flip_normals(moved) if np.prod(np.sign(scale)) < 0 else moved
+
+
+def flip_normals(triangles: Triangles) -> Triangles:
+    """The same triangles with their fronts as backs: every corner order reversed."""
+    return replace(triangles, faces=triangles.faces[:, ::-1])
 
 
 def zero_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -90,6 +90,8 @@ def make_scene(config: dict[str, Any] | SceneTable, *, base: Path | str = ".", n
     for index, shape in enumerate(table.shapes):
         key = f"shapes.{index}"
         triangles = _load_mesh(f"{key}.mesh", shape.mesh, shape.transform, base)
+        if shape.flip_normals:
+            triangles = meshes.flip_normals(triangles)
         material = shape.model_dump(include={"reflectance", "emission", "specular", "exponent"})
         shapes.append((key, triangles, material))
     mesh, mesh_notes = meshes.build_mesh(shapes)

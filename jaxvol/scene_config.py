@@ -150,6 +150,7 @@ class ShapeTable(Table):
     specular: values.rgb(high=1.0) | None = None  # energy of the normalised Phong lobe
     exponent: values.number(low=0.0, high=1e5) = 20.0
     transform: TransformTable = Field(default_factory=TransformTable)
+    flip_normals: bool = False  # fronts become backs: for meshes that are wound inward
 
 
 class PointTable(Table):

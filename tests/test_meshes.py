@@ -254,6 +254,11 @@ def test_a_mirroring_scale_keeps_outside_outside(scale):
     assert volume == pytest.approx(4 * np.pi / 3 * abs(np.prod(scale)), rel=2e-3)
 
 
+def test_flipped_normals_turn_inside_out():
+    sphere = meshes.builtin("sphere")
+    assert areas_and_volume(meshes.flip_normals(sphere))[1] == pytest.approx(-areas_and_volume(sphere)[1])
+
+
 def test_build_mesh_keeps_every_shape_apart():
     shapes = [
         ("shapes.0", meshes.builtin("plane"), {"reflectance": (0.1, 0.2, 0.3)}),

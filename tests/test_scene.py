@@ -7,7 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from jaxvol import camera, meshes, scene_config
+from jaxvol import camera, meshes, ray_casting, scene_config
 from jaxvol.scene import apply_overrides, load_scene, make_scene, read_moments
 
 EVERYTHING = """
@@ -230,6 +230,7 @@ def test_moment_files(tmp_path, name, content):
         ("render.method=path_tracing", lambda f: f.render.method, "path_tracing"),
         ("render.direct.num_steps=8", lambda f: f.render.options["direct"]["num_steps"], 8),
         ("shapes.1.transform.translate=[0,9,0]", lambda f: float(f.scene.mesh.vertices[:, 1].max()), 10.0),
+        ("shapes.0.flip_normals=true", lambda f: ray_casting.face_normals(f.scene.mesh)[0].tolist(), [0, -1, 0]),
         ("render.exposure=auto", lambda f: f.render.exposure, "auto"),
     ],
 )

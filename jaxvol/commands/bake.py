@@ -96,6 +96,9 @@ def bake(
     jobs_of = {}
     for target in chosen:
         jobs_of[target] = _receivers(target, file.scene, resolution, spacing)
+    notes = list(dict.fromkeys(note for what, *_ in jobs_of.values() for note in surface_notes(what)))
+    for note in notes:
+        print(f"note: {note}")
     kit = impulse_response.prepare(file.scene, plan, responses_from=lookups)
     config = {
         "config": file.config,
@@ -145,7 +148,7 @@ def bake(
         "skipped": list(plan.skipped),
         "claims": [{"layers": c.name, "partial": c.partial} for c in impulse_response.claims(file.scene)],
         "shares": {target.value: result.shares for target, result in results.items()},
-        "notes": list(file.notes),
+        "notes": [*file.notes, *notes],
     }
     jobs.write_json(out / f"{file.name}_bake.json", report)
     for target, result in results.items():
@@ -167,11 +170,9 @@ def _receivers(target, scene, resolution, spacing):
     """What is baked, receivers and normals."""
     if target is Target.lightmap:
         unwrapped = lightmap.unwrap(scene.mesh, resolution=resolution)
-        _note_dropped(unwrapped.num_dropped)
         return unwrapped, unwrapped.receiver, unwrapped.normal
     if target is Target.vertices:
         corners = lightmap.vertices(scene.mesh)
-        _note_dropped(corners.num_dropped)
         return corners, corners.receiver, corners.normal
     vertices = np.asarray(scene.mesh.vertices, np.float64)
     bounds = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
@@ -184,9 +185,14 @@ def _receivers(target, scene, resolution, spacing):
     return (low, step, shape), points.astype(np.float32), normals.astype(np.float32)
 
 
-def _note_dropped(num: int) -> None:
-    if num:
-        print(f"note: {num} faces without area are left out")
+def surface_notes(what: lightmap.Lightmap | lightmap.Vertices | tuple) -> list[str]:
+    """What a user should know of the surfaces that are baked; nothing of probes."""
+    if not isinstance(what, lightmap.Lightmap | lightmap.Vertices):
+        return []
+    dropped = [f"{what.num_dropped} faces without area are left out"] if what.num_dropped else []
+    parts = "closed part is" if what.num_inward == 1 else "closed parts are"
+    inward = f"{what.num_inward} {parts} wound inward: the insides are baked; flip_normals = true of the shape turns them"
+    return [*dropped, *([inward] if what.num_inward else [])]
 
 
 def _write_lightmap(what: lightmap.Lightmap, baked: baking.Baked, out: Path, name: str, about: dict) -> list[Path]:

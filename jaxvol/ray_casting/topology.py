@@ -24,11 +24,24 @@ def welded_faces(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def num_bodies(vertices: np.ndarray, faces: np.ndarray) -> int:
     """Connected components of the mesh, vertices at the same place counting as one."""
-    faces = welded_faces(vertices, faces)
-    num_vertices = faces.max() + 1
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
-    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(num_vertices, num_vertices))
-    return int(connected_components(graph, directed=False)[0])
+    return _bodies(welded_faces(vertices, faces))[0]
+
+
+def num_inward_bodies(vertices: np.ndarray, faces: np.ndarray) -> int:
+    """Connected closed components whose fronts face inward: their signed volume is negative."""
+    welded = welded_faces(vertices, faces)
+    proper = _three_corners(welded)
+    if not proper.any():
+        return 0
+    num, body = _bodies(welded[proper])
+    edge, sign = _edges(welded[proper])
+    unpaired = np.bincount(edge, weights=sign) != 0
+    num_open = np.bincount(np.tile(body, 3), weights=unpaired[edge], minlength=num)
+    corners = np.asarray(vertices, np.float64)[faces[proper]]
+    first = np.unique(body, return_index=True)[1]  # volumes are summed about a corner of their own body
+    a, b, c = np.moveaxis(corners - corners[first, 0][body][:, None], 1, 0)
+    volume = np.bincount(body, weights=np.sum(a * np.cross(b, c), axis=1), minlength=num)
+    return int(np.count_nonzero((num_open == 0) & (volume < 0)))
 
 
 def num_open_edges(vertices: np.ndarray, faces: np.ndarray) -> int:
@@ -36,11 +49,30 @@ def num_open_edges(vertices: np.ndarray, faces: np.ndarray) -> int:
 
     Faces without area (two corners at the same place) are left out.
     """
-    faces = welded_faces(vertices, faces)
+    welded = welded_faces(vertices, faces)
+    edge, sign = _edges(welded[_three_corners(welded)])
+    return int(np.count_nonzero(np.bincount(edge, weights=sign)))
+
+
+def _three_corners(faces):
+    """Which faces have three different corners."""
     a, b, c = faces.T
-    faces = faces[(a != b) & (b != c) & (c != a)]
+    return (a != b) & (b != c) & (c != a)
+
+
+def _bodies(faces):
+    """How many connected components there are, and the one of each face."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    used, ends = np.unique(ends, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(len(used), len(used)))
+    num, label = connected_components(graph, directed=False)
+    return int(num), label[ends[: len(faces), 0]]
+
+
+def _edges(faces):
+    """Number of the edge behind each corner, all first ones, then the second and third ones, and the way it is run along."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     sign = np.where(ends[:, 0] < ends[:, 1], 1, -1)
     key = ends.min(1) * (faces.max(initial=0) + 1) + ends.max(1)
-    _, edge = np.unique(key, return_inverse=True)
-    return int(np.count_nonzero(np.bincount(edge, weights=sign)))
+    return np.unique(key, return_inverse=True)[1].reshape(-1), sign

@@ -6,6 +6,7 @@ import numpy as np
 import xatlas
 from jaxtyping import Bool, Float, Int
 
+from jaxvol.ray_casting import topology
 from jaxvol.types import Mesh
 
 _PULL = 1e-3  # of the way from a corner to its face's centre: corners themselves lie inside neighbouring walls
@@ -20,6 +21,7 @@ class Vertices(NamedTuple):
     albedo: Float[np.ndarray, "N 3"]
     faces: Int[np.ndarray, "F 3"]  # faces without area left out
     num_dropped: int  # faces without area
+    num_inward: int  # closed parts whose insides are the front
 
 
 class Lightmap(NamedTuple):
@@ -33,6 +35,7 @@ class Lightmap(NamedTuple):
     normal: Float[np.ndarray, "N 3"]
     albedo: Float[np.ndarray, "N 3"]
     num_dropped: int  # faces without area
+    num_inward: int  # closed parts whose insides are the front
 
 
 def _sound_faces(mesh: Mesh):
@@ -69,6 +72,7 @@ def vertices(mesh: Mesh) -> Vertices:
         albedo=albedo[first // 3].astype(np.float32),
         faces=inverse.reshape(-1, 3).astype(np.int32),
         num_dropped=len(mesh.faces) - len(faces),
+        num_inward=topology.num_inward_bodies(np.asarray(mesh.vertices), np.asarray(mesh.faces)),
     )
 
 
@@ -107,6 +111,7 @@ def unwrap(mesh: Mesh, *, resolution: int, padding: int = 2, uv: Float[np.ndarra
         normal=normals[face].astype(np.float32),
         albedo=np.asarray(mesh.albedo, np.float32)[numbers][face],
         num_dropped=len(mesh.faces) - len(faces),
+        num_inward=topology.num_inward_bodies(np.asarray(mesh.vertices), np.asarray(mesh.faces)),
     )
 
 

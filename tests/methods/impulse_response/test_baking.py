@@ -10,8 +10,10 @@ import trimesh
 
 from jaxvol import harmonics, image, jobs
 from jaxvol.cli import main
+from jaxvol.commands.bake import surface_notes
 from jaxvol.methods import impulse_response
 from jaxvol.methods.impulse_response import baking, lightmap, probes
+from jaxvol.ray_casting import topology
 from jaxvol.scene import make_scene
 from jaxvol.types import Mesh
 
@@ -90,6 +92,21 @@ def test_own_lightmap_coordinates_and_what_is_wrong_with_them():
         lightmap.unwrap(square, resolution=16, uv=np.full((3, 3, 2), 0.5))
     with pytest.raises(ValueError, match="overlap in 120 texels"):
         lightmap.unwrap(square, resolution=16, uv=uv[[0, 0, 2]])
+
+
+def test_closed_parts_that_are_wound_inward_are_counted():
+    sides = {"mesh": "builtin:box", "transform": {"translate": [5.0, 0.0, 0.0]}}
+    shapes = [{"mesh": "builtin:box"}, sides, {"mesh": "builtin:plane", "flip_normals": True}]
+    for inward in (0, 1, 2):
+        for index, shape in enumerate(shapes[:2]):
+            shape["flip_normals"] = index < inward
+        mesh = make_scene({"shapes": shapes}).scene.mesh
+        what = lightmap.vertices(mesh)
+        assert what.num_inward == inward  # the plane has no inside
+        assert [note.partition(":")[0] for note in surface_notes(what)] == [
+            f"{inward} closed part{'s are' * (inward == 2)}{' is' * (inward == 1)} wound inward"
+        ] * (inward > 0)
+    assert topology.num_inward_bodies(np.asarray(mesh.vertices), np.asarray(mesh.faces)[1:]) == 1  # a hole: no inside
 
 
 def test_dilation_fills_from_neighbours_only():
