@@ -1,16 +1,17 @@
 """One picture from several methods: which method computes which layer, what is refused, and the sum.
 
-`from_table` reads [render.layers], `choose` decides by what the scene is (`method = "auto"`); both give an `Assignment`
-in which every layer has one method at most, and no layer is computed in part unless that is allowed. `compose` puts the
-methods' estimates together.
+`from_table` reads [render.layers], `choose` decides by what the scene is and what methods cost (`method = "auto"`); both
+give an `Assignment` in which every layer has one method at most, and no layer is computed in part unless that is
+allowed. `compose` puts the methods' estimates together.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxvol import lights, media
+from jaxvol.costs import Costs
 from jaxvol.layers import NAMES, SURFACE, VOLUME, Claim, from_items, items
 from jaxvol.types import Auxiliary, Estimate, Layers, Scene
 
@@ -18,6 +19,8 @@ _LIFTED = ("converged", "residual", "stopped")  # diagnostics that the command l
 FIRST = ("emission", "surface_from_light", "volume_from_light")
 ALLOW = "allow it with render.allow_partial = true"
 THICK = 3.0  # optical thickness, reduced by the mean cosine, from which a lattice is the right tool
+WORTH = 0.25  # of the path tracer's time: what other methods may add to it together where it is needed anyway
+BASE = "path_tracing"
 PEAKED = 0.5  # mean cosine from which virtual lights are dearer than paths (experiments/benchmark_small.toml)
 
 Claims = Callable[[str], tuple[Claim, ...]]  # of a method, by name, for the scene at hand
@@ -42,6 +45,8 @@ class Assignment:
 
     shares: tuple[Share, ...]
     missing: tuple[str, ...]  # layers that the scene may contain and nobody computes
+    negligible: tuple[str, ...] = ()  # layers left out since they hold next to nothing
+    bound: str | None = None  # why, in words
 
 
 def possible(scene: Scene) -> tuple[str, ...]:
@@ -103,15 +108,28 @@ def _covering(method: str, asked: tuple[str, ...], claims: tuple[Claim, ...], al
     return tuple(found)
 
 
-def choose(scene: Scene, claims_of: Claims, *, allow_partial: bool = False, among: tuple[str, ...] | None = None) -> Assignment:
+def choose(
+    scene: Scene,
+    claims_of: Claims,
+    *,
+    allow_partial: bool = False,
+    among: tuple[str, ...] | None = None,
+    costs: Costs | None = None,
+    tolerance: float = 0.0,
+) -> Assignment:
     """The first method of `preferences` that claims each layer the scene may contain, with the reason why.
 
-    Complete claims go before partial ones; where a layer has partial ones only, ValueError unless they are allowed.
+    Complete claims go before partial ones; where a layer has partial ones only, ValueError unless they are allowed. With
+    `costs`, methods that are dear beside a path tracer that is needed anyway leave their layers to it (`weighed`).
+    Layers that hold less than `tolerance` of the scattered light by `multiple_scattering_bound` are left out.
     """
     order = preferences(scene)
     shares: dict[str, list[tuple[Claim, str]]] = {}
     taken: set[str] = set()
     wanted = tuple(layer for layer in possible(scene) if among is None or layer in among)
+    bound = multiple_scattering_bound(scene)
+    small = tuple(layer for layer in ("volume_from_volume", "volume_from_multiple") if layer in wanted and bound < tolerance)
+    wanted = tuple(layer for layer in wanted if layer not in small)
     for layer in wanted:
         if layer in taken:
             continue
@@ -134,13 +152,79 @@ def choose(scene: Scene, claims_of: Claims, *, allow_partial: bool = False, amon
         shares.setdefault(method, []).append((claim, reason))
         taken.update(claim.layers)
     found = tuple(Share(m, tuple(c for c, _ in pairs), tuple(r for _, r in pairs)) for m, pairs in shares.items())
-    return _assignment(scene, found)
+    if costs is not None:
+        found = weighed(found, claims_of(BASE), costs)
+    assigned = _assignment(scene, found)
+    if not small:
+        return assigned
+    missing = tuple(layer for layer in assigned.missing if layer not in small)
+    why = f"at most {bound:.1g} of the light that the medium scatters is scattered twice"
+    return replace(assigned, missing=missing, negligible=small, bound=why)
+
+
+def weighed(shares: tuple[Share, ...], base: tuple[Claim, ...], costs: Costs) -> tuple[Share, ...]:
+    """The shares without those that are dear beside the path tracer, where that one has a share.
+
+    Its paths carry every layer, so another method only takes noise away. That pays where it adds less time than the
+    noise is worth: t < t_path_tracing s / (1 - s) for a layer with the share s of the noise. Nobody knows s beforehand;
+    methods may add WORTH of the path tracer's time (s above a fifth), the cheapest layers first. More samples make more
+    of them worth it: their time stays the same.
+    """
+    if all(share.method != BASE for share in shares):
+        return shares
+    own = {claim.layers: claim for claim in base}
+    entries = [(share.method, claim, why) for share in shares for claim, why in zip(share.claims, share.reasons, strict=True)]
+    prices = [_price(method, claim, costs) if claim.layers in own else None for method, claim, _ in entries]
+    added, dear = 0.0, set()
+    for index in sorted((i for i, price in enumerate(prices) if price is not None), key=prices.__getitem__):
+        if added + prices[index] <= WORTH * costs.path_tracing:
+            added += prices[index]
+        else:
+            dear.add(index)
+    kept: dict[str, list[tuple[Claim, str]]] = {}
+    for index, (method, claim, why) in enumerate(entries):
+        if index in dear:
+            why = f"comes with the paths; {method} would add some {prices[index]:.2g} s to their {costs.path_tracing:.2g}"
+            method, claim = BASE, own[claim.layers]
+        elif prices[index] is not None:
+            why = f"{why}; some {prices[index]:.2g} s beside {costs.path_tracing:.2g} for paths that are traced anyway"
+        kept.setdefault(method, []).append((claim, why))
+    return tuple(Share(m, tuple(c for c, _ in pairs), tuple(r for _, r in pairs)) for m, pairs in kept.items())
+
+
+def _price(method: str, claim: Claim, costs: Costs) -> float | None:
+    """Seconds of a claim, where there is a rule for them."""
+    by_layer = costs.others.get(method, {})
+    return sum(by_layer[layer] for layer in claim.layers) if set(claim.layers) <= set(by_layer) else None
+
+
+def multiple_scattering_bound(scene: Scene) -> float:
+    """Most of the power scattered once that a medium can scatter again: albedo (1 - exp(-tau)); 1 where there is no bound.
+
+    tau is along the diagonal of the bounds through the largest density: the longest straight way that light has after a
+    scattering. Of the power, not of one picture: it may look away from the light that is scattered once. With surfaces
+    light has ways without end, and `volume_from_multiple` holds what they reflect.
+    """
+    medium = scene.medium
+    if medium is None or scene.mesh is not None or not is_straight(scene):
+        return 1.0
+    low, high = np.asarray(medium.bounds, np.float64)
+    every = (medium, *medium.inclusions)
+    peak = max(_largest(m.density) * float(np.max(np.asarray(media.sigma_t(m)))) for m in every)
+    scattered = [
+        np.asarray(m.sigma_s, np.float64) / np.maximum(np.asarray(media.sigma_t(m), np.float64), 1e-300) for m in every
+    ]
+    return float(np.max(scattered) * -np.expm1(-peak * np.linalg.norm(high - low)))
+
+
+def _largest(density) -> float:
+    return 1.0 if density is None else float(np.max(np.asarray(density)))
 
 
 def preferences(scene: Scene) -> list[tuple[str, tuple[str, ...], str]]:
     """(method, layers, reason) in the order in which `choose` tries them; the figures behind it are in docs/benchmark.md."""
     medium = scene.medium
-    if medium is not None and _refracts(medium):
+    if not is_straight(scene):
         return [("lattice_boltzmann", NAMES, "the medium refracts, and only this method bends rays")]
     order = [("direct", FIRST, "at most one vertex between light and eye: a quadrature without noise")]
     if medium is None or media.is_empty(medium):
@@ -170,9 +254,12 @@ def thickness(scene: Scene) -> float:
     return float(np.max(np.asarray(media.sigma_t(medium)))) * mean * diagonal
 
 
-def _refracts(medium) -> bool:
-    every = (medium, *medium.inclusions)
-    return any(one.ior is not None and float(np.max(np.abs(np.asarray(one.ior) - 1.0))) > 1e-6 for one in every)
+def is_straight(scene: Scene) -> bool:
+    """Whether no medium has a refractive index other than 1."""
+    if scene.medium is None:
+        return True
+    every = (scene.medium, *scene.medium.inclusions)
+    return all(one.ior is None or float(np.max(np.abs(np.asarray(one.ior) - 1.0))) <= 1e-6 for one in every)
 
 
 def _assignment(scene: Scene, shares: tuple[Share, ...]) -> Assignment:

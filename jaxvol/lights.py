@@ -202,7 +202,7 @@ def spot_falloff(spots: SpotLights, index: Int[Array, "*b"], travel: Float[Array
     return jnp.where(width > 0, jnp.clip(ramp, 0.0, 1.0), (angle <= spots.cutoff[index]).astype(jnp.float32))
 
 
-def _counts(scene: Scene) -> dict[str, int]:
+def num_each(scene: Scene) -> dict[str, int]:
     """How many choices each kind of light offers, in order of choice."""
     return {
         "point": 0 if scene.point_lights is None else scene.point_lights.position.shape[0],
@@ -215,7 +215,7 @@ def _counts(scene: Scene) -> dict[str, int]:
 
 def num_lights(scene: Scene) -> int:
     """Number of choices `sample_light` has: all emissive triangles count one, the environment one."""
-    return sum(_counts(scene).values())
+    return sum(num_each(scene).values())
 
 
 def _point_like(position, origin, intensity, shading):
@@ -252,7 +252,7 @@ def sample_light(
     scene: Scene, position: Float[Array, "*b 3"], u1: Float[Array, "*b"], u2: Float[Array, "*b"], u3: Float[Array, "*b"]
 ) -> LightSample:
     """One direction from each position towards one light, chosen uniformly; needs `num_lights(scene) > 0`."""
-    counts = _counts(scene)
+    counts = num_each(scene)
     number = sum(counts.values())
     scaled = u3 * number
     choice = jnp.minimum(scaled.astype(jnp.int32), number - 1)

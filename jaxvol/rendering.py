@@ -27,7 +27,7 @@ import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 import jaxvol
-from jaxvol import composite
+from jaxvol import composite, costs
 from jaxvol.common_stages import CommonStages
 from jaxvol.composite import Share
 from jaxvol.jobs import Parts, Stop
@@ -64,6 +64,7 @@ class Rendering:
     stages: dict[str, float] = field(default_factory=dict)  # compile time included where a stage compiled
     shares: tuple[Share, ...] = ()  # of a composite: who computed what, and why
     missing: tuple[str, ...] = ()  # layers that nobody computed though the scene may contain them
+    negligible: tuple[str, ...] = ()  # layers left out for holding next to nothing, by a bound that `skipped` tells
 
     @property
     def nonfinite_pixels(self) -> int:
@@ -189,12 +190,17 @@ def _render_composite(file: SceneFile, *, on_progress: Progress | None, job: Job
         method="+".join(part.method for part in parts),
         arguments={part.method: part.arguments for part in parts},
         claims=tuple(claim for share in assigned.shares for claim in share.claims),
-        skipped=tuple(f"{part.method}: {line}" for part in parts for line in part.skipped),
+        skipped=(*_left_out(assigned), *(f"{part.method}: {line}" for part in parts for line in part.skipped)),
         seconds=seconds,
         stages={f"{part.method}: {stage}": value for part in parts for stage, value in part.stages.items()},
         shares=assigned.shares,
         missing=assigned.missing,
+        negligible=assigned.negligible,
     )
+
+
+def _left_out(assigned: composite.Assignment) -> list[str]:
+    return [f"auto: {', '.join(assigned.negligible)}: {assigned.bound}"] if assigned.negligible else []
 
 
 def assign(file: SceneFile, *, automatic: bool = False) -> composite.Assignment:
@@ -205,12 +211,25 @@ def assign(file: SceneFile, *, automatic: bool = False) -> composite.Assignment:
 
     allow = file.render.allow_partial
     if automatic or not file.render.layers:
-        assigned = composite.choose(file.scene, claims_of, allow_partial=allow)
+        prices = expected_costs(file)
+        tolerance = file.render.negligible
+        assigned = composite.choose(file.scene, claims_of, allow_partial=allow, costs=prices, tolerance=tolerance)
     else:
         assigned = composite.from_table(file.render.layers, file.scene, claims_of, allow_partial=allow)
     if not assigned.shares:
         raise ValueError("no layer is computed: the scene has no light, or nothing that a camera could see by it")
     return assigned
+
+
+def expected_costs(file: SceneFile) -> costs.Costs | None:
+    """Rough seconds of the methods that have a rule; None without a camera, or where `direct` refuses the scene."""
+    if file.camera is None or not composite.is_straight(file.scene):
+        return None
+    direct, tracer = load_method("direct"), load_method("path_tracing")
+    plan = direct.plan(file.scene, file.camera, **method_arguments(direct, "direct", file)[0])
+    others = {"deep_screen_space": costs.deep_screen_space(file.camera), "direct": costs.direct(file.scene, file.camera, plan)}
+    samples = method_arguments(tracer, "path_tracing", file)[1].get("samples", file.render.samples)
+    return costs.Costs(costs.path_tracing(file.camera, samples), others)
 
 
 def restricted(plan: Any, layers: tuple[str, ...]) -> Any:

@@ -218,6 +218,7 @@ class RenderTable(Table):
     exposure: values.number(low=-100, high=100, unit=" stops") | Literal["auto"] = "auto"
     layers: dict[str, str] | None = None  # which method computes which layer (or sum of layers) of a composite
     allow_partial: bool = False  # whether a composite may use a method that misses some paths of a layer
+    negligible: values.number(low=0, high=1) = 1e-4  # share of the scattered light that "auto" may leave out; 0: none
     options: dict[str, dict[str, Any]] = {}  # filled from [render.<method>]
 
     @model_validator(mode="before")

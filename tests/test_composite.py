@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import composite, layers, rendering
+from jaxvol import composite, costs, layers, rendering
 from jaxvol.common_stages import CommonStages
 from jaxvol.layers import Claim
 from jaxvol.scene import make_scene
@@ -111,6 +111,64 @@ def test_auto_says_why_and_what_it_cannot_do_completely():
         automatic(medium=glass)
     found = automatic(medium=glass, render={"allow_partial": True})
     assert {share.method for share in found.shares} == {"lattice_boltzmann"} and "surface_from_surface" in found.missing
+
+
+def test_auto_weighs_time_where_paths_are_traced_anyway():
+    """Peaked fog wants paths for the rest: quadratures join them only where they are a small part of their time."""
+    few, many = (automatic(medium=FOG | {"anisotropy": 0.8}, render={"samples": samples}) for samples in (1, 65536))
+    assert set(names(few).values()) == {"path_tracing"}
+    assert names(many)["volume_from_light"] == "direct" and names(many)["volume_from_multiple"] == "path_tracing"
+    reasons = {claim.name: why for share in few.shares for claim, why in zip(share.claims, share.reasons, strict=True)}
+    assert "direct would add" in reasons["volume_from_light"]
+    assert not any("beside" in reason for share in automatic().shares for reason in share.reasons)  # no paths: nothing to weigh
+
+
+def test_weighed_takes_the_cheapest_first_and_splits_no_sum():
+    claim = {name: Claim((name,)) for name in ("emission", "volume_from_light", "surface_from_light")}
+    both = Claim(("volume_from_surface", "volume_from_volume"))
+    shares = (
+        composite.Share("direct", tuple(claim.values()), ("x",) * 3),
+        composite.Share("other", (both,), ("y",)),
+        composite.Share("path_tracing", (Claim(("volume_from_multiple",)),), ("z",)),
+    )
+    base = tuple(Claim((name,)) for name in layers.NAMES)
+    seconds = {"emission": 0.1, "volume_from_light": 0.2, "surface_from_light": 0.16}
+    found = composite.weighed(shares, base, costs.Costs(1.04, {"direct": seconds}))
+    assert {s.method: s.layers for s in found} == {
+        "direct": ("emission", "surface_from_light"),
+        "path_tracing": ("volume_from_light", "volume_from_multiple"),
+        "other": both.layers,
+    }
+    assert composite.weighed(shares[:2], base, costs.Costs(0.0, {"direct": seconds})) == shares[:2]
+
+
+def test_costs_of_direct_light_count_its_connections():
+    """Twice the pixels, twice the time; a grid is marched towards every light; what is not computed costs nothing."""
+    direct = rendering.load_method("direct")
+
+    def seconds(**changes):
+        file = scene_file(**changes)
+        return costs.direct(file.scene, file.camera, direct.plan(file.scene, file.camera))
+
+    plain = seconds()
+    wide = seconds(camera=CAMERA | {"width": 24})
+    assert plain["emission"] == 0.0  # a point light is not seen
+    assert wide["volume_from_light"] == pytest.approx(2 * plain["volume_from_light"])
+    assert seconds(lights=[LAMP, LAMP])["surface_from_light"] < 2 * plain["surface_from_light"]
+    grid = seconds(medium=FOG | {"density": np.ones((32, 32, 32))})
+    assert grid["volume_from_light"] > 3 * plain["volume_from_light"]
+
+
+def test_multiple_scattering_of_a_thin_medium_is_left_out_by_its_bound():
+    haze = FOG | {"scattering": 1e-5, "absorption": 0.0}
+    thin = automatic(shapes=[], medium=haze)
+    assert thin.negligible == ("volume_from_volume", "volume_from_multiple") and not thin.missing
+    assert names(thin) == {"volume_from_light": "direct"} and "scattered twice" in thin.bound
+    assert composite.multiple_scattering_bound(scene_file(shapes=None, medium=haze).scene) == pytest.approx(
+        1e-5 * 12**0.5, rel=1e-3
+    )
+    for changes in ({"shapes": [FLOOR]}, {"medium": FOG}, {"render": {"negligible": 0.0}}):
+        assert not automatic(**({"shapes": [], "medium": haze} | changes)).negligible
 
 
 def test_restricted_switches_off_what_nobody_asks():

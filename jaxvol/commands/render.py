@@ -120,9 +120,11 @@ def _explain(result: rendering.Rendering) -> None:
     for claim in () if result.shares else result.claims:
         print(f"{result.method} computes {claim.name}" + (f", partly: {claim.partial}" if claim.partial else ""))
     missing = rendering.unclaimed(result.claims)
-    zero = [name for name in missing if name not in result.missing]
+    zero = [name for name in missing if name not in (*result.missing, *result.negligible)]
     if result.missing:
         print(f"{'nobody computes' if result.shares else f'{result.method} does not compute'} {', '.join(result.missing)}")
+    if result.negligible:
+        print(f"left out by a bound: {', '.join(result.negligible)}")
     if zero:
         print(f"zero in this scene and not computed: {', '.join(zero)}")
 
