@@ -1,7 +1,7 @@
 """Baked irradiance on an open plane below a point light in fog, against the path tracer and quadrature: errors by medium.
 
 `python experiments/bake_open_plane.py [--samples 65536] [--only 0]` writes bake_open_plane.csv and .png: ours, the paper's
-mode (no image source, no back-scattering, similarity), attenuated light alone. The reference of light scattered once on a
+mode (no image source, back-scattering by the epsilon trick), attenuated light alone. The reference of light scattered once on a
 black plane is a quadrature without noise, that of everything is the path tracer with independent samples per receiver;
 finished cases are kept in bake_open_plane.parts. Targets: scattered once 3 %, everything 3 % up to albedo 0.5, 6 % up to 0.99.
 """
@@ -26,7 +26,7 @@ CASES = tuple((c, g, a, 1.0) for a in (0.0, 0.5) for c in (0.5, 0.9, 0.99) for g
 MODES = {
     "ours": {},
     "no image": {"image": False},
-    "paper": {"image": False, "back_scattering": False},
+    "paper": {"image": False, "back_scattering": "epsilon"},
     "attenuated": {"scattering": "attenuated"},
 }
 SIZE, RADII = 12.0, np.linspace(0.0, 3.0, 9)

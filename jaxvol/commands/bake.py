@@ -32,6 +32,14 @@ class Occlusion(StrEnum):
     drop = "drop"
 
 
+class BackScattering(StrEnum):
+    """How patches beside and behind receivers are found."""
+
+    area = "area"
+    epsilon = "epsilon"
+    none = "none"
+
+
 class Scattering(StrEnum):
     """What of the medium is baked."""
 
@@ -39,6 +47,9 @@ class Scattering(StrEnum):
     attenuated = "attenuated"
     single = "single"
     multiple = "multiple"
+
+
+BACK_SCATTERING = {BackScattering.area: True, BackScattering.epsilon: "epsilon", BackScattering.none: False}
 
 
 def bake(
@@ -52,7 +63,10 @@ def bake(
     max_bounces: Annotated[int, typer.Option(help="Surface vertices after the receiver.")] = 6,
     paper: Annotated[bool, typer.Option("--paper", help="All of the paper's modes: those of the options below.")] = False,
     image_source: Annotated[bool, typer.Option(help="Take off light from behind surfaces by image sources.")] = True,
-    back_scattering: Annotated[bool, typer.Option(help="Find patches beside and behind receivers.")] = True,
+    back_scattering: Annotated[
+        BackScattering, typer.Option(help="Patches beside and behind receivers: in area form, by the paper's trick, or not.")
+    ] = BackScattering.area,
+    epsilon: Annotated[float, typer.Option(help="How far the paper's trick lifts receivers, in the scene's units.")] = 0.125,
     occlusion: Annotated[Occlusion, typer.Option(help="Scattered light of occluded emitters.")] = Occlusion.march,
     contrast: Annotated[
         float | None, typer.Option(help="Of density, above which a segment is marched; 1 = never.", min=0, max=1)
@@ -79,13 +93,13 @@ def bake(
     """
     chosen = list(dict.fromkeys(targets or [Target.lightmap]))
     file = load_scene(scene, overrides=list(set_ or []))
-    options = {"scattering": scattering.value, "max_bounces": max_bounces}
+    options = {"scattering": scattering.value, "max_bounces": max_bounces, "epsilon": epsilon}
     if paper:
-        options |= {"image": False, "back_scattering": False, "occlusion": "drop"}
+        options |= {"image": False, "back_scattering": "epsilon", "occlusion": "drop"}
         options |= {"contrast": None, "bounded": None}
         options |= {"similarity": True, "g_range": 0.5 if g_range is None else g_range}
     else:
-        options |= {"image": image_source, "back_scattering": back_scattering, "occlusion": occlusion.value}
+        options |= {"image": image_source, "back_scattering": BACK_SCATTERING[back_scattering], "occlusion": occlusion.value}
         options |= {"similarity": similarity, "g_range": g_range, "legs": legs}
         if contrast is not None:
             options["contrast"] = contrast if contrast < 1 else None

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxvol import media, zonal_lookup
+from jaxvol import media, phase, zonal_lookup
 from jaxvol.types import Medium
 
 Pick = tuple[Float[Array, "*b"], Float[Array, "*b"]]
@@ -45,6 +45,7 @@ class Responses(eqx.Module):
     area: tuple[ResponseGrid, ...]
     albedo: Float[Array, "3"]  # single-scattering albedo
     transport: Float[Array, "3"]  # sigma_t' / sigma_t = 1 - albedo g
+    returned: Float[Array, "3"]  # albedo / 2 p(pi), 1/sr: what a beam of unit irradiance sends back to where it starts
 
 
 def prepare(
@@ -86,7 +87,8 @@ def _prepare(tables, medium, g_range, *, grey, multiple, mode, num_tau, num_angl
         angles = num_angle if kind == "area" else 1
         make = partial(_grid, tables, kind, **options, multiple=multiple, num_tau=num_tau, num_angle=angles)
         grids[kind] = tuple(make(albedo=albedo[i]) for i in range(channels))
-    return Responses(**grids, albedo=albedo, transport=1 - albedo * g)
+    returned = 0.5 * albedo * phase.evaluate(medium, jnp.float32(-1.0))
+    return Responses(**grids, albedo=albedo, transport=1 - albedo * g, returned=returned)
 
 
 def _grid(tables, kind, *, moments, g, albedo, g_range, mode, multiple, num_tau, num_angle):

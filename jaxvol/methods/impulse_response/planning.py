@@ -37,6 +37,7 @@ class Plan:
     open: bool  # nothing occludes anything
     max_bounces: int
     shares: tuple[float, float, float]  # of cosine rays, probes and area points among next vertices
+    epsilon: float | None  # height over receivers of the rays of the paper's back-scattering
     probe_sigma: float
     num_steps: int  # of marching a segment
     num_lanes: int
@@ -78,7 +79,8 @@ def plan(
     *,
     scattering: Scattering = "multiple",
     image: bool = True,
-    back_scattering: bool = True,
+    back_scattering: bool | Literal["epsilon"] = True,
+    epsilon: float = 0.125,
     occlusion: Occlusion = "march",
     contrast: float | None = CONTRAST,
     bounded: float | None = BOUNDED,
@@ -96,7 +98,9 @@ def plan(
         scattering: "surface" ignores the medium, "attenuated" knows its extinction only, "single" and "multiple" add
             light scattered once or however often.
         image: subtract the image source behind receivers (multiple scattering); False is the paper's mode.
-        back_scattering: also find patches beside and behind receivers; False follows cosine rays alone.
+        back_scattering: also find patches beside and behind receivers; False follows cosine rays alone; "epsilon" is the
+            paper's trick (`surface_paths`), for segments that are looked up only.
+        epsilon: how far that trick lifts receivers, in the scene's units as in the paper, > 0.
         occlusion: "march" integrates the light that scatters around an occluder between a receiver and an emitter, last
             leg by last leg; "drop" is the paper's rule, and its share is reported.
         contrast: of density about a receiver's segment, (max - min) / max, above which it is integrated with marched sigma;
@@ -120,6 +124,10 @@ def plan(
         raise ValueError(f"max_bounces: {max_bounces} is not allowed, must be 0 to 64")
     if occlusion not in ("march", "drop"):
         raise ValueError(f"occlusion: {occlusion!r} is not allowed, must be march or drop")
+    if back_scattering not in (True, False, "epsilon"):
+        raise ValueError(f"back_scattering: {back_scattering!r} is not allowed, must be True, False or 'epsilon'")
+    if not 0 < epsilon < np.inf:
+        raise ValueError(f"epsilon: {epsilon} is not allowed, must be > 0")
     if contrast is not None and not 0 <= contrast <= 1:
         raise ValueError(f"contrast: {contrast} is not allowed, must be 0 to 1")
     if bounded is not None and not bounded >= 0:
@@ -169,6 +177,13 @@ def plan(
         skipped.append(f"no tables for the receivers' own segments: the medium is {across:.2g} mean free paths thick")
     elif scatters and not heterogeneous:
         skipped.append("no density varies along segments: none is marched for its contrast")
+    march_occluded = scatters and occlusion == "march" and not bare and segments.is_box(medium)
+    lift = epsilon if scatters and back_scattering == "epsilon" else None
+    if lift is not None and (march_occluded or march_all or (heterogeneous and contrast is not None)):
+        raise ValueError(
+            "back_scattering: 'epsilon' belongs to segments that are looked up: it needs occlusion = 'drop', contrast = None "
+            "and bounded = None here"
+        )
     if not (scatters and back_scattering):
         skipped.append("no probes for back-scattering: next vertices by cosine-distributed rays alone")
     if medium is not None and medium.density is None and segments.is_box(medium):
@@ -177,7 +192,7 @@ def plan(
         scattering=scattering,
         grey=grey,
         image=image and scattering == "multiple",
-        march_occluded=scatters and occlusion == "march" and not bare and segments.is_box(medium),
+        march_occluded=march_occluded,
         contrast=contrast if heterogeneous else None,
         march_all=march_all,
         legs=legs or 1,
@@ -186,7 +201,8 @@ def plan(
         harmonics=harmonics,
         open=bare,
         max_bounces=max_bounces,
-        shares=(0.6, 0.25, 0.15) if scatters and back_scattering else (1.0, 0.0, 0.0),
+        shares=(0.6, 0.25, 0.15) if scatters and back_scattering is True else (1.0, 0.0, 0.0),
+        epsilon=lift,
         probe_sigma=_probe_sigma(scene.mesh, medium),
         num_steps=1 if medium is None else max(1, extinction.num_voxels_across(medium)),
         num_lanes=num_lanes,
@@ -245,7 +261,7 @@ def prepare(scene: Scene, plan: Plan, *, responses_from: zonal_lookup.ZonalTable
     return Kit(
         scene=bare,
         responses=responses,
-        faces=surface_paths.sampled_faces(scene.mesh),
+        faces=surface_paths.sampled_faces(scene.mesh, epsilon=plan.epsilon),
         probe_sigma=jnp.float32(plan.probe_sigma),
         caster=ray_casting.caster_for(scene.mesh, kind=plan.caster),
         marching=None if medium is None else extinction.marching_medium(medium),

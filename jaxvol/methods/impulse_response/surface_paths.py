@@ -9,6 +9,14 @@ and weighted by the density of all three (balance heuristic): a ray, cosine-dist
 of them uniform over the hemisphere for scattered light from walls that meet the surface of x; a probe along the normal
 through a point at distance r ~ sigma e^{-sigma r} in the plane of x, which fits the 1/d of back-scattering
 (specification 8); a point uniform over the area of all faces.
+
+The paper's way to patches behind (5.2), a mode: rays uniform over the sphere start `Faces.epsilon` above x, and what they
+hit in or below the plane of x counts as at distance 0. There d^2 times the response of a point source vanishes with d. It is
+finite in equations (14) to (16) as printed, where the source's 1/d^2 is the same all along the ray: radiance L in dw puts
+
+    L(w') = sigma_s p(pi) max(0, n_y w') int_0^inf e^{-2 sigma_t t} dt  L dw  =  albedo / 2 p(pi) max(0, n_y w')  L dw
+
+around the normal n_y of its patch, and that is what the mode adds; light scattered more often has no such limit.
 """
 
 from functools import partial
@@ -20,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxvol import ray_casting, sampling
+from jaxvol import harmonics, ray_casting, sampling
 from jaxvol.methods.impulse_response import emitters
 from jaxvol.methods.impulse_response.lookup import Pick, Responses
 from jaxvol.methods.impulse_response.receivers import Receiver, like
@@ -31,6 +39,7 @@ _STREAM = sampling.stream("impulse_response.surface_paths")
 _PICK = sampling.stream("impulse_response.lookups")
 _LIFT = 2.0**-16  # offset of rays, relative to coordinates
 _UNIFORM = 0.25  # share of uniform directions among rays, where light is scattered
+_ORDER = 11  # of the lobe that the epsilon trick brings
 
 
 class Faces(eqx.Module):
@@ -39,6 +48,7 @@ class Faces(eqx.Module):
     cdf: Float[Array, "F"]
     density: Float[Array, ""]  # 1 / total area
     scale: Float[Array, ""]  # largest coordinate, for offsets of rays
+    epsilon: Float[Array, ""] | None = None  # lift of receivers in the paper's mode of back-scattering
 
 
 class Proposal(eqx.Module):
@@ -66,9 +76,10 @@ class Arrival(eqx.Module):
     between: tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n"]]  # ray: is y visible from x
     plumb: tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "n"]]  # ray: does a probe find y
     radius: Float[Array, "n"]  # of y in the plane of x
+    behind: Bool[Array, "n"] | None = None  # y lies in or below the plane of x, with `Faces.epsilon`
 
 
-def sampled_faces(mesh: Mesh) -> Faces:
+def sampled_faces(mesh: Mesh, *, epsilon: float | None = None) -> Faces:
     """The table of the area technique; eager. Faces without area are never chosen; ValueError where no face has any."""
     corners = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
@@ -78,6 +89,7 @@ def sampled_faces(mesh: Mesh) -> Faces:
         cdf=jnp.asarray(np.minimum(np.cumsum(area) / area.sum(), 1), jnp.float32),
         density=jnp.float32(1 / area.sum()),
         scale=jnp.float32(np.abs(corners).max()),
+        epsilon=None if epsilon is None else jnp.float32(epsilon),
     )
 
 
@@ -109,6 +121,8 @@ def propose(
     if shares[0] < 1:
         uniform = sampling.direction_about(normal, u[1], jnp.sqrt((1 - u[1]) * (1 + u[1])), u[2])
         ray = jnp.where((v[3] < _UNIFORM)[:, None], uniform, ray)
+    if faces.epsilon is not None:
+        start, ray = position + faces.epsilon * normal, sampling.sample_uniform_sphere(u[1], u[2])
     radius = sampling.sample_exponential(u[1], probe_sigma)
     s, t = sampling.orthonormal_basis(normal)
     sine, cosine = sampling.sin_cos_turn(u[2])
@@ -148,6 +162,10 @@ def arrive(
     geometric = ray_casting.face_normals(mesh)[chosen]
     against = jnp.where(dot(geometric, proposal.direction) > 0, -1.0, 1.0)
     facing = geometric * jnp.where(by_area, proposal.side, against)[:, None]
+    behind = None
+    if faces.epsilon is not None:
+        behind = dot(point - position, normal) <= 8 * _LIFT * faces.scale
+        position = position + faces.epsilon * normal
     delta = point - position
     distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
     start, end = lifted(position, normal, faces.scale), lifted(point, facing, faces.scale)
@@ -172,6 +190,7 @@ def arrive(
             jnp.maximum(room - 2 * _LIFT * faces.scale, 0.0),
         ),
         radius=jnp.sqrt(jnp.maximum(dot(lateral, lateral), 1e-30)),
+        behind=behind,
     )
 
 
@@ -202,7 +221,7 @@ def transport(
     cos_x = jnp.maximum(dot(normal, arrival.direction), 0.0)
     cos_y = jnp.maximum(-dot(arrival.normal, arrival.direction), 0.0)
     spread = jnp.where(visible, cos_y / (arrival.distance * arrival.distance), 0.0)
-    pdf = cos_x * spread / pi
+    pdf = cos_x * spread / pi if arrival.behind is None else spread / (4 * pi)
     if shares[0] < 1:
         even = jnp.where(cos_x > 0, spread, 0.0) / (2 * pi)
         pdf = shares[0] * ((1 - _UNIFORM) * pdf + _UNIFORM * even)
@@ -226,9 +245,19 @@ def transport(
     response = once + more
     seen = visible.reshape(visible.shape + (1,) * (response.ndim - 1))
     response = jnp.where(seen, response, 0.0)
+    if arrival.behind is not None:
+        beam = spread[:, None] * responses.returned
+        response = jnp.where(arrival.behind.reshape(seen.shape), _returned(receiver, arrival, beam), response)
     if marched is not None:
         response = jnp.where(by_marching.reshape(seen.shape), marched, response)
     return plain, like(weight, response) * response
+
+
+def _returned(receiver, arrival, beam):
+    """What a receiver makes of a beam that comes back from the medium around the patch's normal."""
+    lobe = jnp.asarray(harmonics.clamped_cosine(_ORDER), jnp.float32)
+    value = receiver.zonal(jnp.broadcast_to(lobe, (beam.shape[0], 1, _ORDER)), arrival.normal)
+    return like(beam, value) * value
 
 
 def surface_reflectance(mesh: Mesh, face: Int[Array, "n"]) -> Float[Array, "n 3"]:
