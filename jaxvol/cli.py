@@ -86,7 +86,7 @@ def configure_jax() -> None:
     except OSError:
         return  # a home that cannot be written: compile every time
     jax.config.update("jax_compilation_cache_dir", str(cache))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # hundreds of small programs make seconds
 
 
 def _one_line(error: BaseException) -> str:

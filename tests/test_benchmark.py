@@ -15,6 +15,7 @@ from tests.test_cli import SCENE, run
 CONFIG = """
 repeats = 1
 block = 2
+compile_threads = 2
 [reference]
 seconds = 0.5
 [mitsuba]
@@ -32,7 +33,8 @@ entry = "tests.test_benchmark:fog_only"
 rays_per_pixel = 16
 [[methods]]
 name = "lattice_boltzmann"
-settings = [{ resolution = 1 }]
+settings = [{ resolution = 1 }, { resolution = 4 }]
+curves = []
 [[scaling]]
 name = "pixels"
 scene = "tiny"
@@ -175,8 +177,12 @@ def test_errors_take_the_reference_noise_out():
 
 def test_measured_counts_warm_calls_only():
     calls = []
-    first, last, cost = measure.measured(lambda k: calls.append(k) or k, repeats=3)
-    assert calls == [0, 1, 2, 3] and (first, last) == (0, 3) and cost.seconds <= cost.first_seconds + 1e-3
+    last, cost = measure.measured(lambda k: calls.append(k) or k, repeats=3)
+    assert calls == [0, 1, 2, 3] and last == 3 and cost.seconds <= cost.first_seconds + 1e-3
+    _, cost = measure.measured(calls.append, repeats=1, first=measure.First(7.0))
+    assert calls[4:] == [1] and cost.first_seconds == 7.0
+    with pytest.raises(ValueError, match="no"):
+        measure.measured(calls.append, repeats=1, first=measure.First(0.0, ValueError("no")))
     measure.reset_peak()
     before = measure.peak_mib()
     block = np.ones(16 << 20)  # 128 MiB
@@ -190,6 +196,7 @@ def test_measured_counts_warm_calls_only():
         ({"methods": [{"name": "direct"}, {"name": "direct"}]}, "two have one name"),
         ({"scenes": [{"file": "a.toml", "methods": ["direkt"]}]}, "did you mean 'direct'"),
         ({"repeats": 0}, "repeats"),
+        ({"methods": [{"name": "direct", "curves": ["b"]}]}, "curves: no scene 'b'"),
     ],
 )
 def test_bad_files(tmp_path, change, complaint):

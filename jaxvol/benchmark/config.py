@@ -33,6 +33,7 @@ class MethodEntry(Table):
     method: str | None = None  # default: its name
     entry: str | None = None  # "module:function" or the name of an entry point of the group "jaxvol.methods"
     settings: tuple[Settings, ...] = ({},)  # one run each; the first counts as the default
+    curves: tuple[str, ...] | None = None  # scenes in which all settings are run, elsewhere the first only; default: all
     rays_per_pixel: int = Field(4, ge=1)  # that an `entry` gets
 
     @model_validator(mode="after")
@@ -80,6 +81,7 @@ class BenchmarkTable(Table):
     scaling: tuple[ScalingEntry, ...] = ()
     reference: ReferenceTable = Field(default_factory=ReferenceTable)
     mitsuba: PeerTable = Field(default_factory=PeerTable)
+    compile_threads: int = Field(1, ge=1, le=64)  # first calls made at a time, before any warm call of the scene is timed
     repeats: int = Field(3, ge=1)  # warm runs, of which the median counts
     block: int = Field(4, ge=1)  # pixels a side, over which relative L1 and p99 are averaged
     seed: int = Field(1, ge=0)
@@ -89,6 +91,11 @@ class BenchmarkTable(Table):
         known = tuple(method.name for method in self.methods)
         if len(set(known)) < len(known):
             raise PydanticCustomError("value", "methods: two have one name")
+        names = tuple(scene_name(scene) for scene in self.scenes)
+        for method in self.methods:
+            for name in set(method.curves or ()) - set(names):
+                hint = nearest(name, names)
+                raise PydanticCustomError("value", "methods: curves: no scene {name}{hint}", {"name": repr(name), "hint": hint})
         for scene in self.scenes:
             for name in scene.methods or ():
                 if name not in known:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,11 @@ import numpy as np
 from jaxvol import image, jobs, rendering
 from jaxvol.benchmark import errors, peer, runners
 from jaxvol.benchmark.config import BenchmarkTable, MethodEntry, ScalingEntry, SceneEntry, Settings, scene_name
+from jaxvol.benchmark.measure import First
 from jaxvol.benchmark.references import reference
 from jaxvol.layers import NAMES
 from jaxvol.methods import path_tracing
+from jaxvol.scene import SceneFile
 
 Record = dict[str, Any]
 RESULTS = "results.jsonl"
@@ -26,7 +29,9 @@ class Task:
 
     key: str
     title: str
-    run: Callable[[], Record]
+    run: Callable[[First | None], Record]
+    scene: str = ""
+    compile: Callable[[], First] | None = None  # the first call alone, where it may be made beside others
 
 
 def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.Stop | None = None) -> list[Record]:
@@ -37,14 +42,28 @@ def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.S
     left = [task for task in tasks if task.key not in done]
     with jobs.progress("benchmark", total=len(tasks)) as advance:
         advance(len(tasks) - len(left))
+        firsts: dict[str, First] = {}
         for task in left:
+            if config.compile_threads > 1 and task.compile is not None and task.key not in firsts:
+                advance(0, note=f"{task.scene}, compiling")
+                firsts |= _compile([t for t in left if t.scene == task.scene and t.compile], config.compile_threads, stop)
             if stop:
                 break
-            record = {"key": task.key} | task.run()
+            record = {"key": task.key} | task.run(firsts.get(task.key))
             done[task.key] = record
             _write(out, done)
             advance(1, note=task.title)
     return [done[task.key] for task in tasks if task.key in done]
+
+
+def _compile(tasks: list[Task], num_threads: int, stop: jobs.Stop | None) -> dict[str, First]:
+    """First calls by key, several at a time: XLA compiles outside Python's lock. None are begun after `stop`."""
+
+    def one(task: Task) -> tuple[str, First] | None:
+        return None if stop else (task.key, task.compile())
+
+    with ThreadPoolExecutor(num_threads) as pool:
+        return dict(found for found in pool.map(one, tasks) if found is not None)
 
 
 def read_records(out: Path) -> dict[str, Record]:
@@ -82,9 +101,13 @@ def _tasks(config: BenchmarkTable, base: Path, out: Path) -> Iterator[Task]:
         for method in config.methods:
             if entry.methods is not None and method.name not in entry.methods:
                 continue
-            for index, settings in enumerate(method.settings):
-                key = jobs.config_hash(told | {"method": method.model_dump(exclude={"settings"}), "settings": settings})
-                yield Task(key, f"{file.name}, {method.name}", _method_task(config, base, out, entry, method, index, settings))
+            whole = method.curves is None or file.name in method.curves
+            for index, settings in enumerate(method.settings if whole else method.settings[:1]):
+                key = jobs.config_hash(
+                    told | {"method": method.model_dump(exclude={"settings", "curves"}), "settings": settings}
+                )
+                run, compile = _method_task(config, base, out, entry, method, index, settings)
+                yield Task(key, f"{file.name}, {method.name}", run, file.name, compile)
         if config.mitsuba.enabled and entry.peer and peer.installed():
             for samples in config.mitsuba.samples:
                 peers = {"integrator": entry.peer_integrator, "scale": entry.peer_scale, "batches": config.mitsuba.batches}
@@ -109,16 +132,28 @@ def _told(file: Any, entry: SceneEntry, config: BenchmarkTable) -> Record:
 
 def _method_task(
     config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry, method: MethodEntry, index: int, settings: Settings
-) -> Callable[[], Record]:
-    def run() -> Record:
-        name = method.method or method.name
+) -> tuple[Callable[[First | None], Record], Callable[[], First] | None]:
+    """The run, and its first call alone for methods of ours."""
+    name = method.method or method.name
+
+    def load() -> SceneFile:
+        return runners.load_file(entry, base, overrides=() if method.entry else runners.as_overrides(name, settings))
+
+    def compile() -> First:
+        try:
+            file = load()
+        except ValueError as error:
+            return First(0.0, error)
+        return runners.compile_method(file, name, seed=config.seed)
+
+    def run(first: First | None) -> Record:
         record = {"method": method.name, "settings": settings, "index": index}
         try:
-            file = runners.load_file(entry, base, overrides=() if method.entry else runners.as_overrides(name, settings))
+            file = load()
             record = _told(file, entry, config) | record
             right = reference(runners.load_file(entry, base), config.reference, out / "references")
             if method.entry is None:
-                found = runners.run_method(file, name, repeats=config.repeats, seed=config.seed)
+                found = runners.run_method(file, name, repeats=config.repeats, seed=config.seed, first=first)
             else:
                 function = runners.load_function(method.entry)
                 found = runners.run_function(file, method, function, repeats=config.repeats, seed=config.seed)
@@ -132,11 +167,13 @@ def _method_task(
         image.write_exr(picture, image.estimate_channels(found.estimate), metadata=record)
         return record | {"picture": str(picture.relative_to(out))}
 
-    return run
+    return run, None if method.entry else compile
 
 
-def _peer_task(config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry, samples: int) -> Callable[[], Record]:
-    def run() -> Record:
+def _peer_task(
+    config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry, samples: int
+) -> Callable[[First | None], Record]:
+    def run(_: First | None) -> Record:
         file = runners.load_file(entry, base)
         record = _told(file, entry, config) | {"method": PEER, "settings": {"samples": samples}, "index": 0}
         right = reference(file, config.reference, out / "references")
@@ -155,8 +192,8 @@ def _peer_task(config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry,
 
 def _scaling_task(
     config: BenchmarkTable, base: Path, entry: SceneEntry, scaling: ScalingEntry, value: int
-) -> Callable[[], Record]:
-    def run() -> Record:
+) -> Callable[[First | None], Record]:
+    def run(_: First | None) -> Record:
         overrides = tuple(text.replace("{n}", str(value)) for text in scaling.overrides)
         file = runners.load_file(entry, base, overrides=overrides)
         record = _told(file, entry, config) | {"scaling": scaling.name, "method": scaling.method, "value": value}

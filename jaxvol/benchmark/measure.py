@@ -27,21 +27,42 @@ class Cost:
     load: float  # processes that wanted a core in the last minute
 
 
-def measured(call: Callable[[int], Any], *, repeats: int) -> tuple[Any, Any, Cost]:
-    """Results of call(0), the first, and of the last warm call(k), k = 1 .. repeats, and what they cost."""
+@dataclass(frozen=True)
+class First:
+    """A first call that was made beforehand: seconds, or what it refused. Its result is not kept."""
+
+    seconds: float
+    error: ValueError | None = None
+
+
+def first_call(call: Callable[[int], Any]) -> First:
+    """Make call(0), which compiles."""
     start = time.perf_counter()
-    first = call(0)
-    first_seconds = time.perf_counter() - start
+    try:
+        call(0)
+    except ValueError as error:
+        return First(time.perf_counter() - start, error)
+    return First(time.perf_counter() - start)
+
+
+def measured(call: Callable[[int], Any], *, repeats: int, first: First | None = None) -> tuple[Any, Cost]:
+    """The result of the last warm call(k), k = 1 .. repeats, and what they cost; call(0) unless it was made already.
+
+    Raises the ValueError of the first call.
+    """
+    first = first_call(call) if first is None else first
+    if first.error is not None:
+        raise first.error
     gc.collect()
     reset_peak()
-    walls, cpus, last = [], [], first
+    walls, cpus, last = [], [], None
     for k in range(1, repeats + 1):
         wall, cpu = time.perf_counter(), time.process_time()
         last = call(k)
         walls.append(time.perf_counter() - wall)
         cpus.append(time.process_time() - cpu)
-    cost = Cost(first_seconds, statistics.median(walls), statistics.median(cpus), peak_mib(), os.getloadavg()[0])
-    return first, last, cost
+    cost = Cost(first.seconds, statistics.median(walls), statistics.median(cpus), peak_mib(), os.getloadavg()[0])
+    return last, cost
 
 
 def reset_peak() -> None:

@@ -64,6 +64,6 @@ def run_peer(file: SceneFile, entry: SceneEntry, settings: PeerTable, *, samples
     def call(k: int) -> None:
         pictures.append(np.array(mitsuba.render(loaded, seed=seed + 1000 + k, spp=samples), np.float64))
 
-    _, _, cost = measured(call, repeats=settings.batches)
+    _, cost = measured(call, repeats=settings.batches)
     batches = np.stack(pictures[1:])
     return PeerRun(samples, batches.mean(axis=0), batches.var(axis=0, ddof=1), cost)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxvol import camera as cameras
 from jaxvol import rendering
 from jaxvol.benchmark.config import MethodEntry, SceneEntry, Settings, scene_name
-from jaxvol.benchmark.measure import Cost, measured
+from jaxvol.benchmark.measure import Cost, First, first_call, measured
 from jaxvol.layers import from_items, items
 from jaxvol.methods import impulse_response
 from jaxvol.methods.impulse_response import baking, lightmap
@@ -34,7 +34,7 @@ class Run:
 
     estimate: Estimate
     cost: Cost
-    seconds: dict[str, float]  # plan, compile (of the first call), run (the rest of a warm call)
+    seconds: dict[str, float]  # plan, compile, run (the rest of a warm call)
     about: dict[str, Any]  # claims and what else a reader wants
 
 
@@ -55,23 +55,28 @@ def as_overrides(method: str, settings: Settings) -> tuple[str, ...]:
     return tuple(found)
 
 
-def run_method(file: SceneFile, method: str, *, repeats: int, seed: int) -> Run:
+def _rendered(file: SceneFile, method: str, seed: int) -> rendering.Rendering:
+    told = file.render.model_copy(update={"seed": seed})
+    return rendering.render_scene(SceneFile(**{**vars(file), "render": told}), method=method)
+
+
+def compile_method(file: SceneFile, method: str, *, seed: int) -> First:
+    """The first call of one of our methods, for its programs; several may be made at a time."""
+    return first_call(lambda _: _rendered(file, method, seed))
+
+
+def run_method(file: SceneFile, method: str, *, repeats: int, seed: int, first: First | None = None) -> Run:
     """One of our methods, or "auto"; `file` has its settings. Raises ValueError for what it refuses."""
-    first: list[rendering.Rendering] = []
-
-    def call(k: int) -> rendering.Rendering:
-        told = file.render.model_copy(update={"seed": seed + k})
-        result = rendering.render_scene(SceneFile(**{**vars(file), "render": told}), method=method)
-        first.append(result)
-        return result
-
-    _, last, cost = measured(call, repeats=repeats)
+    last, cost = measured(lambda k: _rendered(file, method, seed + k), repeats=repeats, first=first)
     claims = [{"layers": claim.name, "partial": claim.partial} for claim in last.claims]
-    plan = last.seconds["plan"]
-    seconds = {"plan": plan, "compile": first[0].seconds["compile"], "run": max(cost.seconds - plan, 0.0)}
     about = {"claims": claims, "skipped": list(last.skipped), "missing": list(last.missing)}
     about["shares"] = {share.method: list(share.layers) for share in last.shares}
-    return Run(last.estimate, cost, seconds, about)
+    return Run(last.estimate, cost, _seconds(cost, plan=last.seconds["plan"]), about)
+
+
+def _seconds(cost: Cost, *, plan: float = 0.0) -> dict[str, float]:
+    """compile: what the first call took longer than a warm one, tracing and lookups in the compilation cache included."""
+    return {"plan": plan, "compile": max(cost.first_seconds - cost.seconds, 0.0), "run": max(cost.seconds - plan, 0.0)}
 
 
 def load_function(name: str) -> Function:
@@ -106,13 +111,12 @@ def run_function(file: SceneFile, entry: MethodEntry, function: Function, *, rep
     def call(k: int) -> Layers:
         return jax.block_until_ready(function(file.scene, rays, seed + k))
 
-    _, last, cost = measured(call, repeats=repeats)
+    last, cost = measured(call, repeats=repeats)
     if not isinstance(last, Layers):
         raise ValueError(f"entry = {entry.entry!r} must return jaxvol.types.Layers, not {type(last).__name__}")
     mean = from_items({name: jnp.asarray(value).reshape(shape).mean(axis=2) for name, value in items(last)})
-    seconds = {"plan": 0.0, "compile": max(cost.first_seconds - cost.seconds, 0.0), "run": cost.seconds}
     claims = [{"layers": name, "partial": None} for name, _ in items(last)]
-    return Run(Estimate(mean=mean), cost, seconds, {"claims": claims, "skipped": [], "missing": [], "shares": {}})
+    return Run(Estimate(mean=mean), cost, _seconds(cost), {"claims": claims, "skipped": [], "missing": [], "shares": {}})
 
 
 def run_bake(file: SceneFile, *, texels: int, repeats: int, seed: int) -> tuple[Cost, int]:
@@ -127,5 +131,5 @@ def run_bake(file: SceneFile, *, texels: int, repeats: int, seed: int) -> tuple[
     def call(k: int) -> baking.Baked:
         return baking.bake(kit, plan, points, normals, name="texels", samples=samples, seed=seed + k)
 
-    _, _, cost = measured(call, repeats=repeats)
+    _, cost = measured(call, repeats=repeats)
     return cost, len(points)

@@ -125,7 +125,7 @@ def _finish(marching, nodes, eye, light, extra, points):
     return Connections(points, light.direction, light.distance, nodes.weight * light.radiance * factor[..., None])
 
 
-@partial(jax.jit, static_argnames=("kind", "num_steps", "num_points", "num_samples"))
+@partial(jax.jit, static_argnames=("kind", "num_steps", "num_points"))
 def _to_point(
     marching, scene, cells, origin, direction, pixel, sample, seed, k, *, kind, num_steps, num_points, num_samples
 ) -> Connections:
@@ -189,7 +189,7 @@ def _sky_nodes(marching, cells, pixel, sample, seed, num_steps, num_samples, whi
     return nodes, u1, u2
 
 
-@partial(jax.jit, static_argnames=("num_steps", "num_samples"))
+@partial(jax.jit, static_argnames="num_steps")
 def _to_emitters(
     marching, scene, cells, origin, direction, pixel, sample, seed, light, *, num_steps, num_samples
 ) -> Connections:
@@ -205,7 +205,7 @@ def _to_emitters(
     return _finish(marching, nodes, direction, found, weight, points)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "num_samples", "num_phase", "directional"))
+@partial(jax.jit, static_argnames=("num_steps", "num_phase", "directional"))
 def _to_sky(
     marching, scene, cells, origin, direction, pixel, sample, seed, guide, *, num_steps, num_samples, num_phase, directional
 ) -> Connections:
@@ -225,7 +225,7 @@ def _to_infinity(nodes, points, towards, light):
     return Connections(points, towards, jnp.full(nodes.t.shape, jnp.inf, jnp.float32), nodes.weight * light)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "num_samples"))
+@partial(jax.jit, static_argnames="num_steps")
 def _from_field(marching, field, cells, origin, direction, sample, *, num_steps, num_samples):
     """Light from the environment, looked up at nodes by transmittance."""
     shift = patterns.step_shift(sample, num_samples)
@@ -235,7 +235,7 @@ def _from_field(marching, field, cells, origin, direction, sample, *, num_steps,
     return jnp.sum(nodes.weight * sky_field.scattered_radiance(field, points), axis=0)
 
 
-@partial(jax.jit, static_argnames=("num_steps", "num_samples", "num_phase"))
+@partial(jax.jit, static_argnames=("num_steps", "num_phase"))
 def _along_phase(
     marching, scene, cells, origin, direction, pixel, sample, seed, guide, *, num_steps, num_samples, num_phase
 ) -> Connections:

@@ -328,9 +328,10 @@ def render(
     sizes: dict[str, int] | None = {} if plan.num_sets > 1 else None
     names = _computed(plan)
     mean: dict[str, np.ndarray] = {}
+    single = dataclasses.replace(plan, num_sets=1)  # sets share their programs with a picture of one
     squares = {name: np.float32(0.0) for name in names}  # summed squared deviations from the mean (Welford 1962)
     for k in range(plan.num_sets):
-        images, found = render_set(scene, camera, plan, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes)
+        images, found = render_set(scene, camera, single, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes)
         counts = {name: counts.get(name, 0) + value for name, value in found.items()}
         for name in names:
             before = mean.get(name, np.float32(0.0))
