@@ -42,7 +42,7 @@ def run_side(name, side, picture):
     skip = find(name)
     config = skip.present if side == "with" else skip.absent
     options = skip.options | (skip.without if side == "without" else {})
-    file = make_scene(config | {"render": {skip.method: options}})
+    file = make_scene(config | {"render": skip.render(options)})
     result = rendering.render_scene(file, method=skip.method)
     seconds = []
     for _ in range(5):

@@ -1,15 +1,27 @@
 """What is skipped is not in the program: operations of the compiled kernels, and gradients where nothing may be skipped."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol import interval_map, media, transmittance
+from jaxvol import direct, interval_map, media, transmittance
 from jaxvol.benchmark.skips import SKIPS
+from jaxvol.common_stages import CommonStages
+from jaxvol.direct import connections
 from jaxvol.layers import total
+from jaxvol.methods import path_tracing
 from jaxvol.methods.deep_screen_space import kernel
-from jaxvol.rendering import load_method, method_arguments, render_scene
+from jaxvol.methods.instant_multiple_scattering import gathering
+from jaxvol.methods.instant_multiple_scattering.receivers import Points
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
+from jaxvol.methods.path_tracing import driver
+from jaxvol.methods.path_tracing.flight import mean_medium
+from jaxvol.methods.path_tracing.lanes import idle
+from jaxvol.methods.path_tracing.step import Work, step
+from jaxvol.rendering import assign, load_method, method_arguments, render_scene
 from jaxvol.scene import make_scene
 from jaxvol.types import Medium
 
@@ -25,10 +37,12 @@ def sides(skip):
     small = {"resolution": 6, "num_surfels": 64, "num_paths": 8, "samples": 2}
     for config, options in ((skip.present, skip.options), (skip.absent, skip.options | skip.without)):
         options = {key: small.get(key, value) for key, value in options.items()}
-        yield make_scene(config | {"camera": config["camera"] | SIZE, "render": {skip.method: options}})
+        yield make_scene(config | {"camera": config["camera"] | SIZE, "render": skip.render(options)})
 
 
 def plan_of(skip, file):
+    if skip.method == "auto":
+        return assign(file, automatic=True)
     module = load_method(skip.method)
     return module.plan(file.scene, file.camera, **method_arguments(module, skip.method, file)[0])
 
@@ -39,7 +53,7 @@ def test_both_sides_are_scenes_and_the_plans_tell_them_apart(skip):
     files = list(sides(skip))
     plans = [plan_of(skip, file) for file in files]
     structures = [(jax.tree.structure(f.scene), [x.shape for x in jax.tree.leaves(f.scene)]) for f in files]
-    by_value = {"empty space", "unlit surfels", "invisible medium", "thin medium"}  # found while it runs
+    by_value = {"empty space", "unlit surfels"}  # found while it runs
     assert plans[0] != plans[1] or structures[0] != structures[1] or skip.name in by_value
 
 
@@ -156,3 +170,81 @@ def test_gradients_of_equal_channels_stay_apart():
 
     slope = np.asarray(jax.grad(red)(jnp.ones(3)))
     assert abs(slope[0]) > 1e-3 and np.all(np.abs(slope[1:]) < 1e-6)  # the others only move the samples
+
+
+def step_operations(file, *, num_lanes=64):
+    """Of the path tracer's step: what one turn of all lanes computes."""
+    plan = path_tracing.plan(file.scene, file.camera)
+    scene = dataclasses.replace(file.scene, medium=None) if plan.drop_medium else file.scene
+    settings = plan.settings
+    lanes = idle(
+        num_lanes,
+        groups=plan.groups,
+        num_shadows=plan.num_shadows,
+        tracked=settings.tracked,
+        equiangular=settings.equiangular,
+    )
+    work = Work(jnp.uint32(0), jnp.uint32(36), jnp.uint32(0), jnp.int32(0), 36)
+    proxy = mean_medium(scene.medium) if settings.equiangular else None
+
+    def one(scene, lanes):
+        return step(scene, proxy, file.camera, settings, jnp.uint32(0), lanes, driver.no_casts(lanes), work)[0]
+
+    return operations(one, scene, lanes)
+
+
+@pytest.mark.parametrize(
+    ("name", "gone", "share"),
+    [
+        ("no medium", {"log", "log1p"}, 0.6),  # free flights
+        ("no surfaces", set(), 0.9),
+        ("homogeneous, traced", {"while", "scan"}, None),  # tracking; closed forms and two connections take its place
+    ],
+)
+def test_the_path_tracers_step_lacks_what_the_scene_lacks(name, gone, share):
+    ours, theirs = (step_operations(file) for file in sides(skip_named(name)))
+    assert not gone & set(ours) and (not gone or gone & set(theirs))
+    if share is not None:
+        assert sum(ours.values()) < share * sum(theirs.values())
+
+
+def test_virtual_lights_without_a_phase_function():
+    points, lights = 8, 4
+    args = Points(*(jnp.ones((points, 3)) for _ in range(3)), jnp.ones(points))
+    sent = VirtualLights(*(jnp.ones((lights, 3)) for _ in range(3)))
+    counts = [
+        operations(lambda m, i=isotropic: gathering.gather_points(args, sent, m, grey=True, isotropic=i), medium_of())
+        for isotropic in (True, False)
+    ]
+    assert sum(counts[0].values()) < 0.9 * sum(counts[1].values())
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "values"),
+    [
+        ("albedo 0 of surfaces", "surface", (False, True)),
+        ("albedo 0 of the medium", "solve", (False, True)),
+        ("grey, lattice", "num_channels", (1, 3)),
+        ("no refraction", "refract", (False, True)),
+        ("zero-size bounce", "surface", (False, True)),
+        ("g = 0, virtual lights", "isotropic", (True, False)),
+        ("grey", "grey", (True, False)),
+    ],
+)
+def test_stages_that_a_plan_leaves_out(name, field, values):
+    """A static choice: no stage, channel or factor of the other program is called; under "structure" none is left out."""
+    skip = skip_named(name)
+    files = list(sides(skip))
+    assert tuple(getattr(plan_of(skip, file), field) for file in files) == values
+    kept = plan_of(skip, make_scene(skip.present | {"render": skip.render(skip.options | {"specialize": "structure"})}))
+    assert getattr(kept, field) == values[1] or name == "no refraction"  # what the scene does not have stays out
+
+
+def test_one_light_is_one_turn_and_no_surface_no_ray():
+    turns = []
+    for file in sides(skip_named("single light")):
+        plan = direct.plan(file.scene, file.camera)
+        turns.append(len(connections.light_runs(file.scene, None, plan, None, None)))
+    assert turns == [1, 2]
+    bare, walled = sides(skip_named("no surfaces, direct"))
+    assert CommonStages(bare.scene, bare.camera).caster is None and CommonStages(walled.scene, walled.camera).caster is not None
