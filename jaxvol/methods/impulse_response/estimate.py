@@ -47,8 +47,9 @@ def irradiance(
 
     `surface_from_light` is light straight from emitters, `surface_from_volume` light scattered once on the way,
     `surface_from_surface` light from one surface, `surface_from_multiple` the rest. `options` as in `plan` where none is
-    given. `first_item` numbers the receivers, so that a bake in parts draws the same numbers. Biased by what the plan
-    skips, by the tables' infinite medium, and in heterogeneous media by their mean along each segment that is not marched.
+    given. `first_item` numbers the receivers, so that a bake in parts draws the same numbers. Paths walk on at every surface
+    (`baking.bake` and `render` end them in a cache where that is worth it). Biased by what the plan skips, by the tables'
+    infinite medium, and in heterogeneous media by their mean along each segment that is not marched.
 
     Diagnostics: `occluded_share`, single scattering from occluded emitters that was dropped, over all of it; of the
     receivers' own segments `marched_share`; of all lookups `beyond_share`, past the largest tau of the tables; `segments`,
@@ -61,7 +62,8 @@ def irradiance(
     if points.shape != normals.shape or points.shape[-1:] != (3,):
         raise ValueError(f"points {points.shape} and normals {normals.shape} must both have shape [*batch, 3]")
     kit = planning.prepare(scene, decided, responses_from=tables)
-    return bake(kit, points, normals, decided, samples=samples, seed=seed, first_item=first_item, on_progress=on_progress)
+    options = {"samples": samples, "seed": seed, "first_item": first_item, "on_progress": on_progress}
+    return bake(kit, points, normals, decided, **options)
 
 
 def bake(
@@ -75,8 +77,8 @@ def bake(
     first_item: int = 0,
     on_progress: Progress | None = None,
 ) -> Estimate:
-    """`irradiance` with everything prepared; with harmonics in the plan, `diagnostics["harmonics"]` holds
-    the SH of incident radiance [*batch, 9, 3]."""
+    """`irradiance` with everything prepared; with harmonics in the plan, `diagnostics["harmonics"]` holds the SH of incident
+    radiance [*batch, 9, 3], and `diagnostics["harmonics_straight"]` that of `surface_from_light` alone."""
     shape = points.shape[:-1]
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
     tally = Tally()
@@ -113,6 +115,7 @@ def bake(
     }
     if plan.harmonics:
         diagnostics["harmonics"] = jnp.asarray(_shaped(sum(mean[name] for name in SURFACE)[:, 1:], shape))
+        diagnostics["harmonics_straight"] = jnp.asarray(_shaped(mean["surface_from_light"][:, 1:], shape))
     return Estimate(
         # Image sources may take off a little more than there is: no light is negative.
         mean=from_items({name: jnp.asarray(_shaped(np.maximum(_first(mean[name]), 0), shape)) for name in SURFACE}),

@@ -9,19 +9,17 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from jaxvol import ray_casting, sampling
-from jaxvol.methods.impulse_response import emitters, light_sources, surface_paths, walks
+from jaxvol import sampling
+from jaxvol.methods.impulse_response import emitters, final_gather, light_sources, steps, walks
 from jaxvol.methods.impulse_response.kit import Kit, Tally, occluded, thickness
-from jaxvol.methods.impulse_response.light_sources import DELTA, Light, delta_lights
+from jaxvol.methods.impulse_response.light_sources import DELTA, delta_lights
 from jaxvol.methods.impulse_response.receivers import Irradiance, Receiver, first_row, like, nothing
 from jaxvol.methods.impulse_response.walks import Draw
 
 _STREAM = sampling.stream("impulse_response.lights")
 _PICK = sampling.stream("impulse_response.light_lookups")
-_MARCHED = sampling.stream("impulse_response.marched")
 
 
 @partial(jax.jit, static_argnames="image")
@@ -47,13 +45,6 @@ def _arrivals(responses, receiver, light, visible, tau, pick, *, image):
         once, more = emitters.point_arrivals(responses, receiver, light.direction, light.distance, tau, image=image, pick=pick)
     weight = like(light.strength, once)
     return direct, once * weight, more * weight
-
-
-@jax.jit
-def _beyond(responses, tau, counted):
-    grid = responses.point[0]
-    limit = grid.multiple_max
-    return jnp.sum(counted & jnp.any(tau > limit, axis=-1)), jnp.sum(counted)
 
 
 def light_from(
@@ -88,7 +79,7 @@ def light_from(
             by_table = visible if chosen is None else visible & ~chosen
             dropped = ~visible if chosen is None else ~visible & ~chosen
             once, more, lost = _split(once, more, jnp.asarray(by_table), jnp.asarray(dropped))
-            beyond, lookups = _beyond(responses, tau, jnp.asarray(by_table))
+            beyond, lookups = steps.beyond(responses, tau, jnp.asarray(by_table))
             tally.count(beyond=beyond, lookups=lookups)
         else:
             lost = jnp.zeros_like(direct)
@@ -134,7 +125,7 @@ def sampled_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed,
     for number, kind in enumerate(kinds):
         count = counts.get(kind, 1)
         u, pick, index = _numbers(seed, item, sample, 8 * depth + number, count)
-        draw = partial(_marching_numbers, seed, item, sample, number) if own and kit.marches else None
+        draw = partial(steps.marching_numbers, seed, item, sample, number) if own and kit.marches else None
         smooth = not (own and kind in DELTA)
         found = light_from(kit, receiver, position, kind, index, u, own=own, tally=tally, draw=draw, pick=pick, smooth=smooth)
         total = _add(total, found, count)
@@ -154,58 +145,6 @@ def _numbers(seed, item, sample, dimension, count):
     return u, pick, jnp.minimum((u[3] * count).astype(jnp.int32), count - 1)
 
 
-@jax.jit
-def _marching_numbers(seed, item, sample, number, leg):
-    """Four random numbers of one leg of one segment; `number` tells the kinds of emitters apart."""
-    return sampling.uniforms(seed, _MARCHED, item, 8 * leg + number, sample)
-
-
-def _step(kit, receiver, position, item, sample, seed, depth, tally):
-    """The next vertex: (what the receiver makes of a unit of its irradiance, unscattered and scattered, position, normal)."""
-    normal, mesh = receiver.normal, kit.scene.mesh
-    arguments = (item, sample, seed, jnp.int32(depth), kit.probe_sigma)
-    proposal = surface_paths.propose(mesh, kit.faces, position, normal, *arguments, shares=kit.shares)
-    t, face = ray_casting.intersect(kit.caster, proposal.origin, proposal.direction, proposal.t_max)
-    t, face = jnp.asarray(t), jnp.asarray(face)
-    arrival = surface_paths.arrive(mesh, kit.faces, position, normal, proposal, t, face, kit.probe_sigma)
-    visible = plumb = np.ones(item.shape, bool)
-    if kit.shares[0] < 1:  # otherwise the ray itself is the proof
-        visible = ~occluded(kit, *arrival.between)
-        plumb = ~occluded(kit, *arrival.plumb)
-    tau = thickness(kit, position, arrival.direction, arrival.distance)
-    chosen = response = None
-    responses = None if depth == 1 and kit.tables_end else kit.responses
-    if depth == 1 and kit.marches:
-        light = Light(arrival.direction, arrival.distance, jnp.ones_like(position), arrival.normal)
-        sight = visible | np.asarray(proposal.technique == 0)
-        chosen = walks.by_marching(kit, position, normal, light, sight) & np.asarray(arrival.valid)
-        draw = partial(_marching_numbers, seed, item, sample, 7)
-        once, more = walks.march(kit, receiver, position, "area", jnp.zeros_like(item), light, chosen, draw)
-        response = once + more
-        tally.count(segments=chosen.size, marched=int(chosen.sum()))
-    if responses is not None:
-        by_table = np.asarray(arrival.valid) & visible
-        beyond, lookups = _beyond(responses, tau, jnp.asarray(by_table))
-        tally.count(beyond=beyond, lookups=lookups)
-    plain, scattered = surface_paths.transport(
-        mesh,
-        kit.faces,
-        responses,
-        receiver,
-        proposal,
-        arrival,
-        jnp.asarray(visible),
-        jnp.asarray(plumb),
-        tau,
-        kit.probe_sigma,
-        None if chosen is None else jnp.asarray(chosen),
-        response,
-        shares=kit.shares,
-        image=kit.image,
-    )
-    return plain, scattered, arrival.position, arrival.normal
-
-
 def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, tally: Tally) -> dict[str, Array]:
     """One path from each receiver: what it makes of light, by layer, without `delta_arrivals`.
 
@@ -221,42 +160,41 @@ def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, ta
     }
     kinds = (kit.scene.area_lights is not None) + (kit.scene.environment is not None)
     tally.count(traced=kinds * item.size)
+    if kit.max_bounces > 0:
+        bounced = final_gather.bounced if kit.cache is not None else _walked
+        first, several = bounced(kit, receiver, position, item, sample, seed, tally)
+        layers["surface_from_surface"] = first
+        layers["surface_from_multiple"] = layers["surface_from_multiple"] + several
+    return layers
+
+
+def _walked(kit: Kit, receiver: Receiver, position, item, sample, seed, tally: Tally) -> tuple[Array, Array]:
+    """Light of further surfaces by walking on: (unscattered from one surface, the rest)."""
+    kinds = (kit.scene.area_lights is not None) + (kit.scene.environment is not None)
     kinds += len({kind for kind, _ in delta_lights(kit.scene)})
-    first_step = rest = None
+    first_step = rest = only = more = None
     for depth in range(1, kit.max_bounces + 1):
-        *step, position, normal = _step(kit, receiver, position, item, sample, seed, depth, tally)
+        *moved, position, normal = steps.step(kit, receiver, position, item, sample, seed, depth, tally)
         if depth == 1:
-            first_step, rest = step, jnp.ones_like(position)
+            first_step, rest = moved, jnp.ones_like(position)
         else:
-            rest = rest * (step[0] + step[1])
+            rest = rest * (moved[0] + moved[1])
         if depth > 2:
             rest = _survive(first_step, rest, item, sample, seed, jnp.int32(depth))
         receiver = Irradiance(normal)
         found = sampled_arrivals(kit, receiver, position, item, sample, seed, depth, tally=tally)
-        first, several = _collect(first_step, rest, found, split=depth == 1)
-        if depth == 1:
-            layers["surface_from_surface"] = first
-        layers["surface_from_multiple"] = layers["surface_from_multiple"] + several
+        first, several = final_gather.collect(first_step, rest, found[0], found[1] + found[2], split=depth == 1)
+        only, more = (first, several) if depth == 1 else (only, more + several)
         alive = int(_count_alive(first_step, rest))
         tally.count(traced=(1 + kinds) * alive)
         if alive == 0:
             break
-    return layers
+    return only, more
 
 
 @jax.jit
 def _count_alive(first_step, rest):
     return jnp.sum(jnp.any((rest != 0) & (first_row(first_step[0] + first_step[1]) != 0), axis=-1))
-
-
-@partial(jax.jit, static_argnames="split")
-def _collect(first_step, rest, found, *, split: bool):
-    """Light of one vertex at the receiver: (unscattered from one surface where `split`, else None; the rest)."""
-    plain, scattered = first_step
-    direct, more = rest * found[0], rest * (found[1] + found[2])
-    if not split:
-        return None, (plain + scattered) * like(direct + more, plain)
-    return plain * like(direct, plain), scattered * like(direct + more, plain) + plain * like(more, plain)
 
 
 @jax.jit

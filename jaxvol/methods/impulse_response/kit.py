@@ -6,6 +6,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxvol import extinction, ray_casting
 from jaxvol.methods.impulse_response import surface_paths
+from jaxvol.methods.impulse_response.cache import Cache
 from jaxvol.methods.impulse_response.lookup import Responses
 from jaxvol.types import Medium, Scene
 
@@ -29,12 +30,18 @@ class Kit(eqx.Module):
     march_all: bool = eqx.field(static=True, default=False)  # the medium's bounds are near everywhere
     legs: int = eqx.field(static=True, default=1)  # scatter points of a marched segment before the tables
     multiple: bool = eqx.field(static=True, default=True)
+    cache: Cache | None = None  # what surfaces send on; None: paths walk on
     open: bool = eqx.field(static=True, default=False)  # all faces in one plane: nothing occludes
 
     @property
     def tables_end(self) -> bool:
         """Whether the receivers' own segments are all marched: nothing of them is looked up."""
         return self.march_all and (self.march_occluded or self.open)
+
+    @property
+    def walks_surfaces(self) -> bool:
+        """Whether light of surfaces that scatters on its way to a receiver is found by `surface_walks`."""
+        return self.tables_end and self.cache is not None
 
     @property
     def marches(self) -> bool:

@@ -8,8 +8,10 @@ occluders (specification 4, "correct fallback"):
 
 so light scattered once is right in any medium. The second term goes on from z by the phase function and free flight for
 as many `legs` as the plan says, and takes what is left from the tables at the last of them, scattered by the phase function.
-z is drawn by free flight along a uniform direction of the hemisphere, and for emitters at a finite distance also uniformly
-in the half angles at x and y (specification 2), which fits their 1/r^2; both densities count (balance heuristic).
+z is drawn by free flight along a uniform direction of the hemisphere. For emitters at a finite distance it is drawn in
+three ways whose densities all count (balance heuristic): uniformly in the half angles at x and y (specification 2), which
+fits the 1/r^2 of both; along a cosine-distributed direction equi-angular about the emitter, which stays inside the medium;
+and by free flight along it.
 """
 
 from functools import partial
@@ -28,6 +30,7 @@ from jaxvol.methods.impulse_response.emitters import EXTRAPOLATION, slab_share
 from jaxvol.methods.impulse_response.light_sources import Light
 from jaxvol.sampling import dot
 
+_ANGLES, _EVEN = 0.4, 0.3  # shares of places by half angles, and equi-angular along cosine-distributed rays
 _AXIS = (np.arange(8) + 0.5) / 8  # places along the segment
 _COSINES, _TURNS, _DEPTHS = (0.9, 0.5, 0.15), 4, (0.125, 0.375, 0.625, 0.875)  # directions about the normal, depths in the box
 
@@ -83,27 +86,40 @@ def contrast(
 @partial(jax.jit, static_argnames="num_steps")
 def place(marching, position, normal, light: Light, u, *, num_steps: int) -> Place:
     """Draw the last scatter point of each segment by four random numbers."""
-    ring = jnp.sqrt((1 - u[0]) * (1 + u[0]))
-    direction = sampling.direction_about(normal, u[0], ring, u[1])
     if light.infinite:
+        direction = sampling.direction_about(normal, u[0], jnp.sqrt((1 - u[0]) * (1 + u[0])), u[1])
         t, column, density = _free_flight(marching, position, direction, u[2], num_steps)
         return Place(direction, t, column, jnp.where(density > 0, 2 * pi / jnp.maximum(density, 1e-30), 0.0))
-    by_angles = u[3] < 0.5
+    above = sampling.sample_cosine_hemisphere(u[0], u[1], normal)
+    direction, t, column, rho, angles, along = _placed(marching, position, above, light, u, num_steps)
+    pdf = _ANGLES * angles + sampling.sample_cosine_hemisphere_pdf(dot(direction, normal)) * along
+    return Place(direction, t, column, rho / jnp.maximum(pdf, 1e-30))
+
+
+def _placed(marching, position, onward, light, u, num_steps):
+    """A point towards an emitter by one of three techniques, `onward` being the direction of two of them.
+
+    Its direction, distance, column of density and density; the pdf (solid angle, distance) of half angles; the pdf of the
+    distance by the other two, shares included.
+    """
+    by_angles, evenly = u[3] < _ANGLES, (u[3] >= _ANGLES) & (u[3] < _ANGLES + _EVEN)
     total = 0.5 * pi * jnp.sqrt(u[0])  # a + w, uniform over the triangle a, w >= 0, a + w <= pi / 2
     a = total * u[1]
     reach = light.distance * jnp.sin(2 * (total - a)) / jnp.maximum(jnp.sin(2 * total), 1e-6)
     aside = sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2])
-    direction = jnp.where(by_angles[:, None], aside, direction)
-    t, column, density = _free_flight(
-        marching, position, direction, u[2], num_steps, given=jnp.where(by_angles, reach, jnp.inf)
-    )
+    direction = jnp.where(by_angles[:, None], aside, onward)
+    emitter = position + light.distance[:, None] * light.direction
+    t0, t1 = media.box_interval(marching.regions[0].bounds, position, direction)
+    near, _ = sampling.sample_equiangular(u[2], position, direction, t0, t1, emitter)
+    given = jnp.where(by_angles, reach, jnp.where(evenly, near, jnp.inf))
+    t, column, density = _free_flight(marching, position, direction, u[2], num_steps, given=given)
     rest = light.distance[:, None] * light.direction - t[:, None] * direction
     # dt dmu dphi = (4 r^2 / d) da dw dphi, over the triangle's area and all azimuths; `density` is over density of the medium.
     angles = light.distance / (4 * jnp.maximum(dot(rest, rest), 1e-30)) / (pi**3 / 4)
-    flight = jnp.where(dot(direction, normal) > 0, density / (2 * pi), 0.0)
     rho = extinction.region_density(marching, 0, position + t[:, None] * direction)
-    pdf = 0.5 * (angles + flight * rho)
-    return Place(direction, t, column, rho / jnp.maximum(pdf, 1e-30))
+    even = sampling.sample_equiangular_pdf(t, position, direction, t0, t1, emitter)
+    along = _EVEN * jnp.where(t1 > t0, even, 0.0) + (1 - _ANGLES - _EVEN) * density * rho
+    return direction, t, column, rho, angles, along
 
 
 def _free_flight(marching, origin, direction, u, num_steps, given=None):
@@ -144,25 +160,19 @@ def _free_flight(marching, origin, direction, u, num_steps, given=None):
 def onward(marching, points, direction, light: Light, u, *, num_steps: int):
     """The next leg outward from scatter points that see `light`: (direction, distance, factor of throughput [n, 3]).
 
-    Its direction by the phase function, its length by free flight, and for emitters at a finite distance half of the times
-    equi-angular about them: the next connection's 1/r^2 would have an infinite variance otherwise.
+    Its direction by the phase function and its length by free flight; for emitters at a finite distance as in `place`: the
+    1/r^2 of the next connection would have an infinite variance otherwise.
     """
     medium = marching.regions[0]
     turned, _ = phase.sample(medium, direction, u[0], u[1])
     if light.infinite:
         t, column, density = _free_flight(marching, points, turned, u[2], num_steps)
         weight = jnp.where(density > 0, 1 / jnp.maximum(density, 1e-30), 0.0)
-    else:
-        t0, t1 = media.box_interval(medium.bounds, points, turned)
-        emitter = points + light.distance[:, None] * light.direction
-        near, _ = sampling.sample_equiangular(u[2], points, turned, t0, t1, emitter)
-        given = jnp.where(u[3] < 0.5, near, jnp.inf)
-        t, column, density = _free_flight(marching, points, turned, u[2], num_steps, given=given)
-        rho = extinction.region_density(marching, 0, points + t[:, None] * turned)
-        even = sampling.sample_equiangular_pdf(t, points, turned, t0, t1, emitter)
-        weight = rho / jnp.maximum(0.5 * (density * rho + even), 1e-30)
-    through = medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None])
-    return turned, t, through * weight[:, None]
+        return turned, t, medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None]) * weight[:, None]
+    turned, t, column, rho, angles, along = _placed(marching, points, turned, light, u, num_steps)
+    value = phase.evaluate(medium, dot(direction, turned))
+    weight = value * rho / jnp.maximum(_ANGLES * angles + value * along, 1e-30)
+    return turned, t, medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None]) * weight[:, None]
 
 
 def _phase_lobe(medium, order):
@@ -176,10 +186,10 @@ def _phase_lobe(medium, order):
 
 @jax.jit
 def survive(
-    weight: Float[Array, "n 3"], first: Float[Array, "n 3"], free: Bool[Array, "n"], u: Float[Array, "n"]
+    weight: Float[Array, "n 3"], first: Float[Array, "n 3"], free: Bool[Array, "n"], u: Float[Array, "n"], gain: float = 16.0
 ) -> Float[Array, "n 3"]:
-    """Throughputs after Russian roulette on a sixteenth of a walk's first one; 0 where it lost or the way is not free."""
-    chance = jnp.minimum(16 * jnp.max(weight, axis=-1) / jnp.maximum(jnp.max(first, axis=-1), 1e-30), 1.0)
+    """Throughputs after Russian roulette on a `gain`th of a walk's first one; 0 where it lost or the way is not free."""
+    chance = jnp.minimum(gain * jnp.max(weight, axis=-1) / jnp.maximum(jnp.max(first, axis=-1), 1e-30), 1.0)
     kept = jnp.where(free & (u < chance), 1 / jnp.maximum(chance, 1e-30), 0.0)
     return weight * kept[:, None]
 

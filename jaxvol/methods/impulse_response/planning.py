@@ -36,6 +36,7 @@ class Plan:
     harmonics: bool  # incident SH beside irradiance
     open: bool  # nothing occludes anything
     max_bounces: int
+    cached: bool  # paths end at their first vertex, whose light is cached
     shares: tuple[float, float, float]  # of cosine rays, probes and area points among next vertices
     epsilon: float | None  # height over receivers of the rays of the paper's back-scattering
     probe_sigma: float
@@ -89,6 +90,7 @@ def plan(
     g_range: float | None = None,
     harmonics: bool = False,
     max_bounces: int = 6,
+    cached: bool = True,
     num_lanes: int = 1 << 14,
     caster: str = "auto",
 ) -> Plan:
@@ -114,6 +116,7 @@ def plan(
         g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
         harmonics: also bake SH of incident radiance.
         max_bounces: surface vertices after the receiver; 0 bakes the emitters' own light.
+        cached: bakes of many paths know the irradiance of further vertices from a cache (`radiosity`); False walks on.
         num_lanes: paths traced together, at most.
 
     Raises ValueError for a scene without surfaces or with a bent medium, and for counts out of range.
@@ -201,6 +204,7 @@ def plan(
         harmonics=harmonics,
         open=bare,
         max_bounces=max_bounces,
+        cached=cached,
         shares=(0.6, 0.25, 0.15) if scatters and back_scattering is True else (1.0, 0.0, 0.0),
         epsilon=lift,
         probe_sigma=_probe_sigma(scene.mesh, medium),

@@ -9,7 +9,7 @@ import numpy as np
 from jaxvol import camera as cameras
 from jaxvol import first_hit, materials, sampling, zonal_lookup
 from jaxvol.layers import SURFACE, from_items
-from jaxvol.methods.impulse_response import estimate, gather, planning
+from jaxvol.methods.impulse_response import estimate, gather, planning, radiosity
 from jaxvol.methods.impulse_response.kit import Kit, Tally, thickness
 from jaxvol.methods.impulse_response.planning import Plan
 from jaxvol.methods.impulse_response.receivers import Irradiance, Reflection
@@ -38,6 +38,7 @@ def render(
     tally = Tally()
     total = camera.height * camera.width
     lanes = estimate.lanes_for(total, plan.num_lanes)
+    kit = radiosity.cached(kit, *_first_surfaces(kit, camera, total, lanes), plan, num_paths=samples * total, seed=seed)
     mean = {name: np.zeros((total, 3)) for name in SURFACE}
     square = {name: np.zeros((total, 3)) for name in SURFACE}
     for sample in range(samples):
@@ -60,6 +61,15 @@ def render(
         means[name] = jnp.asarray(np.maximum(average, 0).astype(np.float32).reshape(shape))
         variances[name] = jnp.asarray(spread.astype(np.float32).reshape(shape))
     return Estimate(mean=from_items(means), variance=from_items(variances), num_samples=jnp.float32(samples))
+
+
+def _first_surfaces(kit, camera, total, lanes):
+    """Points and normals that some of the pixels see."""
+    rays = _pixel_rays(camera, jnp.arange(lanes) * total // lanes, jnp.zeros(lanes, jnp.int32), jnp.uint32(0))
+    hits = first_hit.first_hits(kit.scene, rays, kit.caster)
+    normal = _receiver(kit.scene.mesh, hits, rays.direction).normal
+    seen = np.flatnonzero(np.asarray(hits.valid))
+    return np.asarray(hits.position)[seen], np.asarray(normal)[seen]
 
 
 @jax.jit

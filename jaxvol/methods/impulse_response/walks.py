@@ -37,9 +37,9 @@ def march(kit: Kit, receiver: Receiver, position, kind: str, index, light: Light
     rows, num = np.flatnonzero(chosen), chosen.shape[0]
     if rows.size == 0:
         return nothing(receiver), nothing(receiver)
-    lanes = _ranks(rows, num)
-    part, position, index, seen = _take((receiver, position, index, light), lanes, num)
-    numbers = _take(draw(0), lanes, num)
+    lanes = ranks(rows, num)
+    part, position, index, seen = take((receiver, position, index, light), lanes, num)
+    numbers = take(draw(0), lanes, num)
     place = marched.place(kit.marching, position, part.normal, seen, numbers, num_steps=kit.num_steps)
     once, more = _walk(kit, part.normal, position, kind, index, seen, place, rows, num, draw)
     found = _to_receiver(part, place.direction, once, more)
@@ -69,8 +69,8 @@ def _walk(kit: Kit, normal, position, kind, index, seen, place, rows, num, draw)
             brought = weight * marched.scattered_more(*arguments, image=kit.image)
             more[walks] += np.asarray(brought)[: walks.size]
             break
-        lanes = _ranks(rows[walks], num)
-        numbers, chance = _take((draw(leg), draw(kit.legs + leg)[0]), lanes, num)
+        lanes = ranks(rows[walks], num)
+        numbers, chance = take((draw(leg), draw(kit.legs + leg)[0]), lanes, num)
         outward, distance, factor = marched.onward(kit.marching, points, outward, again, numbers, num_steps=kit.num_steps)
         free = jnp.asarray(~occluded(kit, points, outward, distance))
         weight = marched.survive(weight * factor, first, free, chance)
@@ -80,19 +80,19 @@ def _walk(kit: Kit, normal, position, kind, index, seen, place, rows, num, draw)
             break
         walks = walks[alive]
         state = (normal, position, index, seen, place, points, outward, weight, first)
-        state = _take(state, _ranks(alive, num), weight.shape[0])
+        state = take(state, ranks(alive, num), weight.shape[0])
         normal, position, index, seen, place, points, outward, weight, first = state
     return jnp.asarray(once), jnp.asarray(more)
 
 
-def _ranks(rows, num):
+def ranks(rows, num):
     """Rows filled up to a number of lanes of which there are three, so that few programs are compiled."""
     lanes = next(lanes for lanes in (num // 16, num // 4, num) if rows.size <= lanes and (lanes >= _RANKS or lanes == num))
     return np.concatenate([rows, np.full(lanes - rows.size, rows[0])]).astype(np.int32)
 
 
 @partial(jax.jit, static_argnames="num")
-def _take(tree, rows, num):
+def take(tree, rows, num):
     """Rows of every array of `num` rows."""
     return jax.tree.map(lambda x: x[rows] if jnp.shape(x)[:1] == (num,) else x, tree)
 
