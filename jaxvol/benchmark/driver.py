@@ -57,13 +57,17 @@ def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.S
 
 
 def _compile(tasks: list[Task], num_threads: int, stop: jobs.Stop | None) -> dict[str, First]:
-    """First calls by key, several at a time: XLA compiles outside Python's lock. None are begun after `stop`."""
+    """First calls by key, of several methods at a time: XLA compiles outside Python's lock. None are begun after `stop`.
 
-    def one(task: Task) -> tuple[str, First] | None:
-        return None if stop else (task.key, task.compile())
+    Settings of one method share programs, and two threads would compile them twice: they take turns.
+    """
+
+    def of_method(title: str) -> dict[str, First]:
+        return {task.key: task.compile() for task in tasks if task.title == title and not stop}
 
     with ThreadPoolExecutor(num_threads) as pool:
-        return dict(found for found in pool.map(one, tasks) if found is not None)
+        groups = pool.map(of_method, dict.fromkeys(task.title for task in tasks))
+        return {key: first for group in groups for key, first in group.items()}
 
 
 def read_records(out: Path) -> dict[str, Record]:
@@ -167,7 +171,8 @@ def _method_task(
         image.write_exr(picture, image.estimate_channels(found.estimate), metadata=record)
         return record | {"picture": str(picture.relative_to(out))}
 
-    return run, None if method.entry else compile
+    shares_programs = name == "auto"  # with all others: compiled after them
+    return run, None if method.entry or shares_programs else compile
 
 
 def _peer_task(
