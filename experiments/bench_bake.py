@@ -1,6 +1,6 @@
 """How fast is the bake: segments a second, what the medium costs at equal noise, lookups, and baking by path tracing.
 
-    python experiments/bench_bake.py [segments overhead lookups path_tracing] [--size 96] [--out DIR]
+    python experiments/bench_bake.py [segments overhead lookups path_tracing] [--size 96] [--share 16] [--out DIR]
 
 Writes bench_bake_<part>.csv. Times are CPU seconds of this process, warm. Targets: 1 M segments per CPU-second of a
 surface-only bake, 4 % overhead of the medium at equal noise, 20 ns a lookup, a hundredth of the time of baking by path tracing
@@ -21,7 +21,7 @@ from bake_open_plane import scene as open_plane
 
 from jaxvol import image, layers, tables
 from jaxvol.methods import impulse_response, path_tracing
-from jaxvol.methods.impulse_response import estimate, lightmap, lookup
+from jaxvol.methods.impulse_response import baking, estimate, lightmap, lookup
 from jaxvol.scene import load_scene
 
 SCENES = Path(__file__).resolve().parent / "scenes"
@@ -43,20 +43,20 @@ def receivers(name, size):
     return scene, what.receiver, what.normal
 
 
-def baked(scene, points, normals, samples, **options):
-    """One bake with everything repeated that a user repeats but reading files: plan, tables, casters."""
+def baked(scene, points, normals, samples, *, share=1, **options):
+    """One bake with everything repeated that a user repeats but reading files: plan, tables, casters, cache."""
     plan = impulse_response.plan(scene, None, **options)
-    return estimate.bake(impulse_response.prepare(scene, plan), points, normals, plan, samples=samples, seed=0)
+    kit = impulse_response.prepare(scene, plan)
+    return baking.bake(kit, plan, points, normals, name="bench", samples=samples, share=share)
 
 
 def spread(found):
     """Mean relative variance of the lightmap's irradiance."""
-    mean = np.asarray(layers.total(found.mean)).mean(axis=-1)
-    variance = sum(np.asarray(getattr(found.variance, name)).mean(axis=-1) for name in layers.SURFACE)
+    mean, variance = baking.total(found).mean(axis=-1), found.variance.mean(axis=-1)
     return float(np.mean(variance / (mean * mean + 0.01 * mean.mean() ** 2)))
 
 
-def segments(size):
+def segments(size, share):
     """Segments per CPU-second by scene and mode."""
     for name in ("cornell_fog", "street_canyon"):
         scene, points, normals = receivers(name, size)
@@ -69,26 +69,29 @@ def segments(size):
             yield {"scene": name, "mode": mode, "million_per_cpu_second": count / cpu / 1e6, "cpu": cpu, "wall": wall}
 
 
-def overhead(size):
-    """Time to equal noise of the lightmap over a surface-only bake, at two qualities."""
+def overhead(size, share):
+    """Time to equal noise of the lightmap over a surface-only bake that shares nothing, at two qualities."""
     for name in ("cornell_fog", "street_canyon"):
         scene, points, normals = receivers(name, size)
         for quality, samples in (("low", 8), ("high", 64)):
             base = None
-            for mode, options in (
-                ("surface-only", {"scattering": "surface"}),
-                ("attenuated", {"scattering": "attenuated"}),
-                ("all bounces, rays alone", {"back_scattering": False, "occlusion": "drop"}),
-                ("all bounces, occluded dropped", {"occlusion": "drop"}),
-                ("all bounces", {}),
+            for mode, sharing, options in (
+                ("surface-only", 1, {"scattering": "surface"}),
+                ("attenuated", 1, {"scattering": "attenuated"}),
+                ("all bounces", 1, {}),
+                ("all bounces, tables alone", 1, {"occlusion": "drop", "bounded": None}),
+                ("surface-only, shared", share, {"scattering": "surface"}),
+                ("all bounces, shared", share, {}),
+                ("all bounces, tables alone, shared", share, {"occlusion": "drop", "bounded": None}),
             ):
-                cpu, _, found = timed(partial(baked, scene, points, normals, samples, **options))
+                cpu, _, found = timed(partial(baked, scene, points, normals, samples, share=sharing, **options))
                 noise = spread(found)
                 base = (cpu, noise) if base is None else base
                 yield {
                     "scene": name,
                     "quality": quality,
                     "mode": mode,
+                    "share": sharing,
                     "cpu": cpu,
                     "relative_variance": noise,
                     "time_over_surface_only": cpu / base[0] - 1,
@@ -96,7 +99,7 @@ def overhead(size):
                 }
 
 
-def lookups(size):
+def lookups(size, share):
     """Nanoseconds of one lookup, everything that precedes the shading: single and multiple scattering are one band set each."""
     num = 1 << 16
     medium = open_plane(0.9, 0.0, 0.0).medium
@@ -124,44 +127,54 @@ def lookups(size):
             yield {"emitter": kind, "how": how, "ns": ns, "band_sets": 2, "ns_per_band_set": ns / 2}
 
 
-def path_traced(size):
+def path_traced(size, share):
     """Time to equal error of irradiance: baking by path tracing over our bake, both against one more path-traced reference."""
-    place = np.stack(np.meshgrid(np.linspace(-3, 3, 24), np.linspace(-3, 3, 24), indexing="ij"), axis=-1).reshape(-1, 2)
-    flat = np.concatenate([place, np.zeros((len(place), 1))], axis=1).astype(np.float32)
+    flat = np.concatenate([grid_on_plane(size), np.zeros((size * size, 1))], axis=1).astype(np.float32)
     up = np.tile(np.float32([0, 0, 1]), (len(flat), 1))
-    canyon, cornell = receivers("street_canyon", size // 2), receivers("cornell_fog", size // 2)
+    emitters_only = {"max_bounces": 0}
     cases = {
-        "open plane, albedo 0.5": ((open_plane(0.5, 0.0, 0.0), flat, up), 1, 4096),
-        "open plane, albedo 0.9": ((open_plane(0.9, 0.0, 0.0), flat, up), 1, 4096),
-        "open plane, albedo 0.9, reflecting": ((open_plane(0.9, 0.0, 0.5), flat, up), 32, 2048),
-        "cornell_fog": (cornell, 64, 512),
-        "street_canyon": (canyon, 16, 256),
+        "open plane, albedo 0.5": ((open_plane(0.5, 0.0, 0.0), flat, up), 1, 4096, 1, emitters_only),
+        "open plane, albedo 0.9": ((open_plane(0.9, 0.0, 0.0), flat, up), 1, 4096, 1, emitters_only),
+        "open plane, albedo 0.9, reflecting": ((open_plane(0.9, 0.0, 0.5), flat, up), 64, 4096, share, {}),
+        "cornell_fog": (receivers("cornell_fog", size), 32, 2048, share, {}),
+        "street_canyon": (receivers("street_canyon", size), 32, 2048, share, {}),
     }
-    for name, ((scene, points, normals), paths, samples) in cases.items():
-        options = {"max_bounces": 0} if "plane" in name and "reflecting" not in name else {}
-        cpu, _, found = timed(partial(baked, scene, points, normals, paths, **options))
-        trace = partial(path_tracing.irradiance, scene, points + 1e-4 * normals, normals)
+    for name, ((scene, points, normals), paths, samples, sharing, options) in cases.items():
+        cpu, _, found = timed(partial(baked, scene, points, normals, paths, share=sharing, **options))
+        some = np.sort(np.random.default_rng(0).permutation(len(points))[:1024])  # path traced at some of the texels
+        trace = partial(path_tracing.irradiance, scene, points[some] + 1e-4 * normals[some], normals[some])
         trace(samples=16)
         start = time.process_time()
         reference = trace(samples=samples)
-        traced = time.process_time() - start
+        traced = (time.process_time() - start) * len(points) / len(some)
         truth = np.asarray(layers.total(reference.mean)).mean(axis=-1)
         variance = np.asarray(next(iter(reference.variance.sums.values()))).mean(axis=-1)
-        ours = np.asarray(layers.total(found.mean)).mean(axis=-1)
+        ours = baking.total(found)[some].mean(axis=-1)
         scale = truth * truth + 0.01 * truth.mean() ** 2
         own = (np.square(ours - truth) - variance) / scale  # of every receiver; the reference's noise taken off
         error = float(own.mean() + 2 * own.std() / np.sqrt(own.size))  # not more than this: it may be small beside the noise
         noise = float(np.mean(variance / scale))
+        own_l1 = image.relative_l1(ours[:, None], truth[:, None])
+        noise_l1 = float(np.sqrt(variance).sum() * np.sqrt(2 / np.pi) / truth.sum())
+        left_l1 = np.sqrt(max(own_l1**2 - noise_l1**2, (0.2 * own_l1) ** 2))
         yield {
             "scene": name,
+            "texels": len(points),
             "bake_cpu": cpu,
             "bake_relmse_at_most": error,
-            "bake_relative_l1": image.relative_l1(ours[:, None], truth[:, None]),
+            "bake_relative_l1": own_l1,
             "path_tracing_cpu": traced,
             "path_tracing_relmse": noise,
+            "path_tracing_relative_l1": noise_l1,
             "path_tracing_us_per_path": traced / samples / len(points) * 1e6,
-            "times_faster_at_equal_error_at_least": traced * noise / (cpu * error),
+            "times_faster_at_equal_relmse_at_least": traced * noise / (cpu * error),
+            "times_faster_at_equal_l1": traced * noise_l1**2 / (cpu * left_l1**2),
         }
+
+
+def grid_on_plane(size):
+    """Places [size^2, 2] around the foot of the light."""
+    return np.stack(np.meshgrid(*[np.linspace(-3, 3, size)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 PARTS = {"segments": segments, "overhead": overhead, "lookups": lookups, "path_tracing": path_traced}
@@ -171,12 +184,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default=list(PARTS), metavar="PART")
     parser.add_argument("--size", type=int, default=96, help="texels along the lightmap's side")
+    parser.add_argument("--share", type=int, default=16, help="texels that share a place of scattered light")
     parser.add_argument("--out", type=Path, default=Path("out"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for part in arguments.parts:
         rows = []
-        for row in PARTS[part](arguments.size):
+        for row in PARTS[part](arguments.size, arguments.share):
             rows.append(row)
             print(", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
         with open(arguments.out / f"bench_bake_{part}.csv", "w", newline="") as file:

@@ -77,10 +77,14 @@ def bake(
     ] = None,
     legs: Annotated[
         int | None,
-        typer.Option(help="Scatter points of a marched segment before the tables. Default: 2 to 8 if bounded, else 1.", min=1),
+        typer.Option(help="Scatter points of a marched segment before the tables. Default: 2 to 16 if bounded, else 1.", min=1),
     ] = None,
     similarity: Annotated[bool, typer.Option(help="Multiple scattering by similarity to an isotropic medium.")] = False,
     g_range: Annotated[float | None, typer.Option(help="Single scattering interpolated between three values of g.")] = None,
+    share: Annotated[
+        int,
+        typer.Option(help="Texels that share one place of reflected and scattered light; 1: none do.", min=1),
+    ] = 4,
     harmonics: Annotated[bool, typer.Option(help="SH of incident light in the lightmap's channels.")] = True,
     table_file: Annotated[Path | None, typer.Option("--tables", help="Table file; default: the shipped set.")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the scene.")] = None,
@@ -96,7 +100,7 @@ def bake(
     options = {"scattering": scattering.value, "max_bounces": max_bounces, "epsilon": epsilon}
     if paper:
         options |= {"image": False, "back_scattering": "epsilon", "occlusion": "drop"}
-        options |= {"contrast": None, "bounded": None}
+        options |= {"contrast": None, "bounded": None, "cached": False}
         options |= {"similarity": True, "g_range": 0.5 if g_range is None else g_range}
     else:
         options |= {"image": image_source, "back_scattering": BACK_SCATTERING[back_scattering], "occlusion": occlusion.value}
@@ -121,6 +125,7 @@ def bake(
         "seed": seed,
         "resolution": resolution,
         "spacing": spacing,
+        "share": share,
         "harmonics": harmonics,
         "tables": None if table_file is None else str(table_file),
         "versions": rendering.versions(),
@@ -145,6 +150,7 @@ def bake(
                     name=target.value,
                     samples=samples,
                     seed=seed,
+                    share=share if target is Target.lightmap else 1,
                     parts=parts,
                     stop=stop,
                     on_progress=advance,

@@ -47,16 +47,19 @@ def bake(
     """Bake receivers [N, 3] in parts called `name-<number>`; parts that are done are taken from the store.
 
     With `share` > 1 one of so many receivers has light that met surface or medium computed, the others interpolate it
-    (`sharing`); light straight from emitters is computed at all. Biased then where it bends within a group of them.
+    (`sharing`), by samples sqrt(share) paths, about where noise per time is least; light straight from emitters is computed
+    at all, by `samples`. Biased then where light bends within a group of receivers.
     `on_progress` gets the number of receivers that were finished. Raises `Interrupted` between parts once `stop` is set.
     """
+    more = round(samples * share**0.5)
+    kit = radiosity.cached(kit, points, normals, plan, num_paths=more * len(points) // share, seed=seed)
     job = _Job(plan, samples, seed, parts, stop)
-    kit = radiosity.cached(kit, points, normals, plan, num_paths=samples * len(points) // share, seed=seed)
     if share == 1 or len(points) <= share:
         return _in_parts(kit, job, points, normals, name, on_progress)
     shared = sharing.choose(points, normals, share=share, caster=None if kit.open else kit.caster)
     straight = _in_parts(replace(kit, responses=None, max_bounces=0, cache=None), job, points, normals, f"{name}-straight")
     told = None if on_progress is None else lambda count: on_progress(count * len(points) / len(shared.rows))
+    job = job._replace(samples=more)
     rest = _in_parts(kit, job, points[shared.rows], normals[shared.rows], f"{name}-shared", told)
     irradiance = {layer: np.maximum(shared.spread(value), 0) for layer, value in rest.irradiance.items()}
     variance = straight.variance + shared.spread_variance(rest.variance - rest.variance_straight)
