@@ -22,7 +22,7 @@ def step(kit: Kit, receiver: Receiver, position, item, sample, seed, depth: int,
     proposal = surface_paths.propose(mesh, kit.faces, position, normal, *arguments, shares=kit.shares)
     t, face = ray_casting.intersect(kit.caster, proposal.origin, proposal.direction, proposal.t_max)
     t, face = jnp.asarray(t), jnp.asarray(face)
-    arrival = surface_paths.arrive(mesh, kit.faces, position, normal, proposal, t, face, kit.probe_sigma)
+    arrival = surface_paths.arrive(mesh, kit.faces, position, normal, proposal, t, face)
     visible = plumb = np.ones(item.shape, bool)
     if kit.shares[0] < 1:  # otherwise the ray itself is the proof
         visible = ~occluded(kit, *arrival.between)

@@ -98,6 +98,11 @@ def lifted(position: Float[Array, "*b 3"], normal: Float[Array, "*b 3"], scale: 
     return position + (_LIFT * scale) * normal
 
 
+def _probe_height(radius, faces):
+    """How far above the plane of x probes start: low beside it, so that no wall nearby hides what lies there."""
+    return 0.5 * radius + 8 * _LIFT * faces.scale
+
+
 @partial(jax.jit, static_argnames="shares")
 def propose(
     mesh: Mesh,
@@ -126,7 +131,8 @@ def propose(
     radius = sampling.sample_exponential(u[1], probe_sigma)
     s, t = sampling.orthonormal_basis(normal)
     sine, cosine = sampling.sin_cos_turn(u[2])
-    above = position + radius[:, None] * (cosine[:, None] * s + sine[:, None] * t) + (0.25 / probe_sigma) * normal
+    above = position + radius[:, None] * (cosine[:, None] * s + sine[:, None] * t)
+    above = above + _probe_height(radius, faces)[:, None] * normal
     face = sampling.sample_cdf(u[3], faces.cdf)
     a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
     w1, w2 = sampling.sample_triangle(v[0], v[1])
@@ -152,7 +158,6 @@ def arrive(
     proposal: Proposal,
     t: Float[Array, "n"],
     face: Int[Array, "n"],
-    probe_sigma: Float[Array, ""],
 ) -> Arrival:
     """The next vertex from the answers of the proposal's rays, and the rays that tell what else could have found it."""
     hits = ray_casting.hits(mesh, proposal.origin, proposal.direction, t, face)
@@ -173,7 +178,9 @@ def arrive(
     length = jnp.sqrt(jnp.maximum(dot(way, way), 1e-30))
     height = dot(delta, normal)
     lateral = delta - height[:, None] * normal
-    room = 0.25 / probe_sigma - height
+    radius = jnp.sqrt(jnp.maximum(dot(lateral, lateral), 1e-30))
+    top = _probe_height(radius, faces)
+    room = top - height
     # Nearer than the rays' offset, directions from the point and from the ray disagree: in an edge the pdf would vanish.
     apart = distance > 8 * _LIFT * faces.scale
     return Arrival(
@@ -185,11 +192,11 @@ def arrive(
         distance=distance,
         between=(start, way / length[:, None], length * (1 - 1e-5)),
         plumb=(
-            position + lateral + (0.25 / probe_sigma) * normal,
+            position + lateral + top[:, None] * normal,
             -normal,
             jnp.maximum(room - 2 * _LIFT * faces.scale, 0.0),
         ),
-        radius=jnp.sqrt(jnp.maximum(dot(lateral, lateral), 1e-30)),
+        radius=radius,
         behind=behind,
     )
 

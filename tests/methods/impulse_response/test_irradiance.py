@@ -98,7 +98,7 @@ def test_the_papers_trick_for_patches_behind(g):
     proposal = surface_paths.propose(scene.mesh, kit.faces, position, normal, *arguments, shares=plan.shares)
     t, face = ray_casting.intersect(kit.caster, proposal.origin, proposal.direction, proposal.t_max)
     hits = jnp.asarray(t), jnp.asarray(face)
-    arrival = surface_paths.arrive(scene.mesh, kit.faces, position, normal, proposal, *hits, kit.probe_sigma)
+    arrival = surface_paths.arrive(scene.mesh, kit.faces, position, normal, proposal, *hits)
     yes, tau = jnp.ones(num, bool), jnp.ones((num, 3))
     receiver = receivers_of.Irradiance(normal)
     common = (proposal, arrival, yes, yes, tau, kit.probe_sigma, None, None)
