@@ -22,6 +22,7 @@ from jaxvol.types import Medium
 POSITIONS = ("midpoint", "jittered", "far")
 _OPAQUE = 1.0 - 1e-7  # largest argument of -log1p(-x): nearest float32 below 1 that keeps the column finite
 _TINY = 1e-30
+_NOTHING = 1e-12  # share of a ray's column that a step may hold and count as empty
 
 
 class IntervalMap(eqx.Module):
@@ -64,25 +65,21 @@ def column_at(
     (1 - exp(-sigma_c D))/(1 - exp(-sigma_c total)) = level, by Newton steps from the left (the function is concave, so
     that they never overshoot): every channel is then sampled well, also when they are 100:1 apart.
     """
-    # A channel without extinction drops linearly: the limit of a faint one.
-    sigma = jnp.maximum(sigma_t[:, None], 1e-6 / jnp.maximum(total, _TINY))  # [3, R]
-    drop = -jnp.expm1(-sigma * total)
-    first = -jnp.log1p(-jnp.minimum(level * drop[0], _OPAQUE)) / sigma[0]
+    # In shares of the column, so that rays of any length, or without medium, are alike. A channel without extinction
+    # drops linearly: the limit of a faint one.
+    tau = jnp.maximum(sigma_t[:, None] * total, 1e-6)  # [3, R]
+    drop = -jnp.expm1(-tau)
+    own = [-jnp.log1p(-jnp.minimum(level * drop[c], _OPAQUE)) / tau[c] for c in range(1 if grey else 3)]
     if grey:
-        return jnp.minimum(first, total)
-    own = [first, *(-jnp.log1p(-jnp.minimum(level * drop[c], _OPAQUE)) / sigma[c] for c in (1, 2))]
+        return jnp.minimum(own[0], 1.0) * total
     start = jnp.minimum(jnp.minimum(own[0], own[1]), own[2])
 
-    def newton(_, column):
-        transmittance = [jnp.exp(-sigma[c] * column) for c in range(3)]
-        reached = sum(-jnp.expm1(-sigma[c] * column) / drop[c] for c in range(3)) / 3.0
-        slope = sum(sigma[c] * transmittance[c] / drop[c] for c in range(3)) / 3.0
-        return jnp.clip(column + (level - reached) / jnp.maximum(slope, _TINY), column, total)
+    def newton(_, share):
+        reached = sum(-jnp.expm1(-tau[c] * share) / drop[c] for c in range(3)) / 3.0
+        slope = sum(tau[c] * jnp.exp(-tau[c] * share) / drop[c] for c in range(3)) / 3.0
+        return jnp.clip(share + (level - reached) / jnp.maximum(slope, _TINY), share, 1.0)
 
-    # drop is 0 only on rays without medium: there the start, 0, is the answer.
-    empty = total <= 0.0
-    drop = jnp.where(empty, 1.0, drop)
-    return jnp.where(empty, 0.0, lax.fori_loop(0, 10, newton, start))
+    return lax.fori_loop(0, 10, newton, start) * total
 
 
 def march(
@@ -120,14 +117,19 @@ def total_column(marched: Marched) -> Float[Array, "R"]:
 def invert_column(marched: Marched, column: Float[Array, "N R"]) -> Float[Array, "N R"]:
     """Distances at which the column (piecewise linear in t) reaches `column`, the nearest where it is flat; exact.
 
-    t = start + step sum_k clip((column - before_k)/rise_k, 0, 1): a sum over the steps instead of a search, no gathers.
+    t = start + step sum_k clip(column - before_k, 0, rise_k)/rise_k: a sum over the steps instead of a search, no gathers.
+    Steps that hold nothing to speak of are passed at once, so that no derivative divides by their rise.
     """
+    total = lax.stop_gradient(total_column(marched))  # as the unit: the answer does not depend on it
+    scale = 1.0 / jnp.where(total > _TINY, total, 1.0)
+    column = column * scale
 
     def body(state, density):
         before, steps = state
-        rise = density * marched.step
-        steps = steps + jnp.clip((column - before) / jnp.maximum(rise, _TINY), 0.0, 1.0)
-        return (before + rise, steps), None
+        rise = density * marched.step * scale
+        filled = rise > _NOTHING
+        share = jnp.clip(column - before, 0.0, rise) / jnp.where(filled, rise, 1.0)
+        return (before + rise, steps + jnp.where(filled, share, jnp.where(column > before, 1.0, 0.0))), None
 
     zero = jnp.zeros_like(column)
     (_, steps), _ = lax.scan(body, (jnp.zeros_like(marched.start), zero), marched.density)

@@ -65,7 +65,11 @@ def dot(a: Float[Array, "*b 3"], b: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
 
 def normalize(v: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """v / |v|; the zero vector stays zero, with finite gradients."""
-    return v * lax.rsqrt(jnp.maximum(dot(v, v), 1e-37))[..., None]
+    # By the largest component first, a constant as far as the result goes: squares neither under- nor overflow.
+    largest = lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
+    there = largest > 0
+    v = v / jnp.where(there, largest, 1.0)
+    return v * lax.rsqrt(jnp.where(there, dot(v, v)[..., None], 1.0))
 
 
 def orthonormal_basis(n: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:

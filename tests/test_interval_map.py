@@ -1,5 +1,7 @@
 """Interval maps against closed forms and against marches in float64 numpy."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -216,3 +218,21 @@ def test_wrong_positions_are_refused():
         im.levels(4, 8, position="middle")
     with pytest.raises(ValueError, match="u, one number"):
         im.levels(4, 8, position="jittered")
+
+
+def test_slopes_beside_empty_space(rays):
+    """One voxel filled, the others empty or nearly: the slope by every voxel is finite, and by all of them right."""
+    density = np.full((4, 4, 4), 1e-25)
+    density[:2], density[1, 2, 2] = 0.0, 2.0
+    told = medium((1.0, 3.0, 0.5), (0.1, 0.0, 2.0), density)
+
+    def total(scale, grid):
+        held = eqx.tree_at(lambda m: m.density, told, grid * scale)
+        found = im.interval_map(held, *rays, num_intervals=4, num_steps=16)
+        return jnp.sum(found.weight * found.distance[:, None])
+
+    with_slopes = jax.jit(jax.value_and_grad(total, argnums=(0, 1)))
+    value, (slope, by_voxel) = with_slopes(jnp.float32(1), told.density)
+    assert np.isfinite(np.asarray(by_voxel)).all()
+    up, down = (float(with_slopes(jnp.float32(1 + h), told.density)[0]) for h in (0.02, -0.02))
+    assert float(value) > 1 and float(slope) == pytest.approx((up - down) / 0.04, rel=1e-2)

@@ -71,6 +71,17 @@ def test_pcg4d_matches_the_published_integer_code():
         assert got == reference(list(v))
 
 
+def test_normalize_has_no_smallest_length():
+    """Vectors whose squares under- or overflow, and the zero vector, with their gradients both ways."""
+    v = jnp.asarray([[3.0, 0.0, 4.0]]) * jnp.asarray([[1e-30], [1e-12], [1.0], [1e30], [0.0]])
+    unit, slope = jax.jvp(sampling.normalize, (v,), (v[:, ::-1],))
+    np.testing.assert_allclose(unit[:4], np.tile([0.6, 0.0, 0.8], (4, 1)), rtol=1e-6)
+    # (I - u u') w / |v| with w = (4, 0, 3) |v| / 5
+    np.testing.assert_allclose(slope[:4], np.tile([0.8 - 0.96 * 0.6, 0.0, 0.6 - 0.96 * 0.8], (4, 1)), rtol=1e-5, atol=1e-7)
+    assert (np.asarray(unit[4]) == 0).all() and (np.asarray(slope[4]) == 0).all()
+    assert np.isfinite(jax.grad(lambda v: jnp.sum(sampling.normalize(v)[:, 0]))(v)).all()
+
+
 @pytest.mark.parametrize("g", [-0.95, -0.5, 0.0, 1e-4, 0.3, 0.8])
 def test_henyey_greenstein(g):
     u1, u2, _, _ = draw(NUM)

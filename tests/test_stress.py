@@ -14,7 +14,7 @@ from jaxvol.layers import items
 from jaxvol.methods.deep_screen_space import kernel
 from jaxvol.methods.path_tracing import flight
 from jaxvol.scene import make_scene
-from jaxvol.stress import checks, driver, extremes, scenes
+from jaxvol.stress import checks, driver, extremes, gradients, scenes
 from jaxvol.types import Layers, Medium
 
 FEW = settings(max_examples=60, deadline=None)
@@ -106,6 +106,39 @@ def test_light_from_nothing_is_caught(monkeypatch):
     assert any("their mean 1.1" in line for line in driver.run_case(config, 8, "fog_furnace", "any")["failed"])
 
 
+@jax.jit
+def stage(numbers, count):
+    """The first slope is infinite where a number is zero, the second nowhere."""
+    return jnp.sqrt(numbers) * count, jnp.sin(numbers), count
+
+
+def test_slopes_that_are_not_finite_are_found(monkeypatch):
+    """In stages of any module, at the inputs they were given; once for each shape, and not inside another stage."""
+    monkeypatch.setattr(phase, "stage", stage, raising=False)
+    for numbers, complaint in (([1.0, 2.0, 3.0], None), ([1.0, 0.0, 3.0], "stage: 1 of 3 slopes of output 0")):
+        with gradients.recording() as stages:
+            for _ in range(2):
+                phase.stage(jnp.asarray(numbers), 3)
+            jax.jit(lambda x: phase.stage(x, 3))(jnp.asarray(numbers))
+        assert len(stages) == 1
+        found = gradients.finite(stages)
+        assert found is None if complaint is None else complaint in found
+    assert phase.stage is stage
+
+
+def test_slopes_are_those_of_float64_and_of_differences():
+    """One direction, both precisions; integers are no parameters."""
+    key, told = "stage", gradients.Stage("stage", stage.__wrapped__, ((np.array([1.0, 2.0], np.float32), np.int32(3)), {}))
+    values, slopes = gradients.derivative(key, told)
+    with jax.enable_x64(True):
+        exact, right = gradients.derivative(key, told, kind=np.float64)
+    assert [x.dtype for x in (*values, *slopes, *exact, *right)] == [np.float32] * 4 + [np.float64] * 4
+    for found, wanted in zip((*values, *slopes), (*exact, *right), strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-6)
+    along = right[0] * 2 * np.sqrt([1.0, 2.0]) / 3
+    np.testing.assert_allclose(right[1], np.cos([1.0, 2.0]) * along)
+
+
 def test_a_crash_is_a_failure_and_a_refusal_is_none(monkeypatch):
     def crash(config, method, seed=0):
         raise IndexError("out of range")
@@ -120,7 +153,7 @@ def test_a_crash_is_a_failure_and_a_refusal_is_none(monkeypatch):
 def test_a_stopped_run_goes_on(tmp_path, monkeypatch):
     calls = []
 
-    def run_case(config, number, name, method):
+    def run_case(config, number, name, method, *, differentiated=False):
         calls.append(number)
         return {"failed": [], "passed": ["sound"], "seconds": 0.0}
 
@@ -135,7 +168,7 @@ def test_scenes_are_drawn_until_enough_are_taken(tmp_path, monkeypatch):
     """Two of five classes refused: 30 are taken all the same, apart from the refused; a method that takes none ends."""
     monkeypatch.setattr(driver, "extreme_cases", list)
 
-    def run_case(config, number, name, method):
+    def run_case(config, number, name, method, *, differentiated=False):
         if method == "impulse_response" and number % 5 < 2 or method == "lattice_boltzmann":
             return {"refused": "no"}
         return {"failed": [], "passed": ["sound"], "seconds": 0.0}

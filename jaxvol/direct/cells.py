@@ -154,7 +154,9 @@ def place(
 
     share, end, width = pick(density), pick(cumulative), pick(spread)
     begin, finish, cell_begin, rho = pick(low), pick(high), pick(cells.t[:-1]), pick(cells.density)
-    v = jnp.clip(1.0 - (end - target) / jnp.maximum(share, 1e-37), 0.0, 1.0)
+    there = share > 0
+    share = jnp.where(there, share, 1.0)
+    v = jnp.clip(1.0 - (end - target) / share, 0.0, 1.0)
     region = None if cells.region is None else pick(cells.region)
     owner = [None if region is None else region == r for r in range(len(marching.regions))]
     if point is None:
@@ -166,7 +168,7 @@ def place(
         t = jnp.clip(closest + _from_angle(v * width * distance, begin - closest, distance), begin, finish)
         inverse_pdf = width * (distance * distance + (t - closest) * (t - closest))
     # 1 / pdf(t) = total / share * 1 / pdf(t in the cell)
-    scale = jnp.where(share > 0, total / jnp.where(share > 0, share, 1.0) * inverse_pdf, 0.0) * (rho / u.shape[0])
+    scale = jnp.where(there, total / share * inverse_pdf, 0.0) * (rho / u.shape[0])
     columns = tuple(
         pick(c[:-1]) + (rho * (t - cell_begin) if o is None else jnp.where(o, rho * (t - cell_begin), 0.0))
         for c, o in zip(cells.column, owner, strict=True)

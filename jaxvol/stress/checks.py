@@ -8,7 +8,7 @@ import numpy as np
 from jaxvol import rendering
 from jaxvol.layers import items, total
 from jaxvol.scene import make_scene
-from jaxvol.stress import scenes
+from jaxvol.stress import gradients, scenes
 from jaxvol.types import Layers
 
 # Small enough to be fast, large enough to run every stage.
@@ -137,3 +137,4 @@ def brightest(config: scenes.Config) -> float:
 def clear_caches() -> None:
     """Forget compiled programs: hundreds of shapes would fill the memory."""
     jax.clear_caches()
+    gradients.clear_caches()

@@ -3,15 +3,18 @@
 import json
 import math
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from jaxvol import jobs
-from jaxvol.stress import checks, extremes, scenes
+from jaxvol.stress import checks, extremes, gradients, scenes
 
 RESULTS = "stress.jsonl"
-# Of each class every second scene in other units, every tenth turned.
-_EVERY_UNITS, _EVERY_TURN = 2, 10
+# Of each class every second scene in other units, every tenth turned, every fiftieth differentiated.
+_EVERY_UNITS, _EVERY_TURN, _EVERY_GRADIENT = 2, 10, 50
+CHECKS = ("sound", "linear", "units", "turned", "furnace", "gradient")
+_EXTREME = "extreme: "
 _MOST_DRAWS = 4  # random scenes a method is offered, for each that it shall take
 
 Record = dict[str, Any]
@@ -30,11 +33,14 @@ def _numbered(number: int) -> tuple[str, int, scenes.Config]:
 
 def extreme_cases() -> list[Case]:
     """(key, "extreme", None, scene) of all extremes."""
-    return [(f"extreme: {name}", "extreme", None, config) for name, config in extremes.extremes()]
+    return [(f"{_EXTREME}{name}", "extreme", None, config) for name, config in extremes.extremes()]
 
 
-def run_case(config: scenes.Config, number: int | None, name: str, method: str) -> Record:
-    """All checks of one scene by one method: {"refused": why} or {"failed": [...], "passed": [...]}."""
+def run_case(config: scenes.Config, number: int | None, name: str, method: str, *, differentiated: bool = False) -> Record:
+    """All checks of one scene by one method: {"refused": why} or {"failed": [...], "passed": [...]}.
+
+    Every stage that the scene goes through is `differentiated` if so asked.
+    """
     failed, passed = [], []
 
     def note(what: str, found: str | None) -> None:
@@ -45,7 +51,8 @@ def run_case(config: scenes.Config, number: int | None, name: str, method: str) 
 
     start = time.perf_counter()
     try:
-        layers = checks.render(config, method)
+        with gradients.recording() if differentiated else nullcontext() as stages:
+            layers = checks.render(config, method)
     except checks.Refused as error:
         return {"refused": str(error)}
     except (ValueError, TypeError, ArithmeticError, IndexError) as error:
@@ -65,6 +72,8 @@ def run_case(config: scenes.Config, number: int | None, name: str, method: str) 
                 note("turned", checks.turns(config, method))
             if name.endswith("furnace"):
                 note("furnace", checks.furnace(config, method))
+            if differentiated:
+                note("gradient", gradients.finite(stages))
         except checks.Refused as error:  # the scene was taken before: its other forms must be, but for numbers out of range
             note("range" if "must be" in str(error) else "refused", None if "must be" in str(error) else str(error))
     return {"failed": failed, "passed": passed, "seconds": time.perf_counter() - start}
@@ -122,11 +131,18 @@ def _run_cases(
             if name != before:
                 checks.clear_caches()  # the next class has other shapes, and hundreds of programs would fill the memory
             before = name
-            done[key, method] = {"case": key, "class": name, "method": method} | run_case(config, number, name, method)
+            found = run_case(config, number, name, method, differentiated=_is_differentiated(key, number))
+            done[key, method] = {"case": key, "class": name, "method": method} | found
             advance(1, note=key)
             if count % 20 == 0:
                 _write(path, done)
     _write(path, done)
+
+
+def _is_differentiated(key: str, number: int | None) -> bool:
+    if number is None:
+        return key.removeprefix(_EXTREME).startswith(extremes.CORNERS)
+    return number // len(scenes.CLASSES) % _EVERY_GRADIENT == 0
 
 
 def _read(path: Path) -> dict[tuple[str, str], Record]:
@@ -143,11 +159,11 @@ def _write(path: Path, records: dict[tuple[str, str], Record]) -> None:
 def table(records: list[Record]) -> str:
     """Cases tried, refused and failed, by method, and checks made."""
     head = f"{'method':28s} {'scenes':>7s} {'random':>7s} {'refused':>8s} {'failed':>7s} {'checks':>7s}"
-    lines = [head + "  sound linear  units turned furnace"]
+    lines = [head + "  sound linear  units turned furnace gradient"]
     for method in dict.fromkeys(r["method"] for r in records):
         mine = [r for r in records if r["method"] == method]
         run_ = [r for r in mine if "refused" not in r]
-        made = {k: sum(k in r["passed"] for r in run_) for k in ("sound", "linear", "units", "turned", "furnace")}
+        made = {k: sum(k in r["passed"] for r in run_) for k in CHECKS}
         total = sum(len(r["passed"]) + len(r["failed"]) for r in run_)
         lines.append(
             f"{method:28s} {len(run_):7d} {sum(r['class'] != 'extreme' for r in run_):7d} {len(mine) - len(run_):8d} "

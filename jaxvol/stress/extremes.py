@@ -6,6 +6,12 @@ import numpy as np
 
 from jaxvol.stress.scenes import GRID, Config, draw, in_units
 
+# Beginnings of the names of extremes in which every stage is differentiated.
+CORNERS = (
+    "optical depth 1e-06", "optical depth 10000", "g ", "albedo ", "channels ", "density contrast 1e+08", "empty grid",
+    "one voxel filled",
+)  # fmt: skip
+
 
 def extremes() -> Iterator[tuple[str, Config]]:
     """Name and scene of every extreme."""
