@@ -51,7 +51,7 @@ def bake(
     at all, by `samples`. Biased then where light bends within a group of receivers.
     `on_progress` gets the number of receivers that were finished. Raises `Interrupted` between parts once `stop` is set.
     """
-    more = round(samples * share**0.5)
+    more = round(samples * np.sqrt(share))
     kit = radiosity.cached(kit, points, normals, plan, num_paths=more * len(points) // share, seed=seed)
     job = _Job(plan, samples, seed, parts, stop)
     if share == 1 or len(points) <= share:

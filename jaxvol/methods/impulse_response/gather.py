@@ -118,31 +118,32 @@ def sampled_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed,
     """
     total = [nothing(receiver)] * 4
     own = depth == 0
-    counts = {kind: sum(k == kind for k, _ in delta_lights(kit.scene)) for kind in DELTA}
-    kinds = [kind for kind, count in counts.items() if count and (not own or kit.marches)]
+    delta = {kind for kind, _ in delta_lights(kit.scene)}
+    kinds = [kind for kind in DELTA if kind in delta and (not own or kit.marches)]
     kinds += ["area"] if kit.scene.area_lights is not None else []
     kinds += ["environment"] if kit.scene.environment is not None else []
     for number, kind in enumerate(kinds):
-        count = counts.get(kind, 1)
-        u, pick, index = _numbers(seed, item, sample, 8 * depth + number, count)
+        u, pick = _numbers(seed, item, sample, 8 * depth + number)
+        index, weight = jnp.zeros_like(item), jnp.ones(item.shape, jnp.float32)
+        if kind in delta:  # scattered light of own segments falls off as 1/d, light of further vertices as 1/d^2
+            index, weight = light_sources.choose(kit.scene, position, kind, u[3], falloff=1 if own else 2)
         draw = partial(steps.marching_numbers, seed, item, sample, number) if own and kit.marches else None
         smooth = not (own and kind in DELTA)
         found = light_from(kit, receiver, position, kind, index, u, own=own, tally=tally, draw=draw, pick=pick, smooth=smooth)
-        total = _add(total, found, count)
+        total = _add(total, found, weight)
     return tuple(total)
 
 
 @jax.jit
-def _add(total, found, count):
-    return [a + count * b for a, b in zip(total, found, strict=True)]
+def _add(total, found, weight):
+    return [a + weight.reshape(weight.shape + (1,) * (b.ndim - 1)) * b for a, b in zip(total, found, strict=True)]
 
 
 @jax.jit
-def _numbers(seed, item, sample, dimension, count):
-    """Random numbers of one light choice, of its lookup, and the index chosen among `count`."""
+def _numbers(seed, item, sample, dimension):
+    """Random numbers of one light choice and of its lookup."""
     u = sampling.uniforms(seed, _STREAM, item, dimension, sample)
-    pick = sampling.uniforms(seed, _PICK, item, dimension, sample)[:2]
-    return u, pick, jnp.minimum((u[3] * count).astype(jnp.int32), count - 1)
+    return u, sampling.uniforms(seed, _PICK, item, dimension, sample)[:2]
 
 
 def path_arrivals(kit: Kit, receiver: Receiver, position, item, sample, seed, tally: Tally) -> dict[str, Array]:

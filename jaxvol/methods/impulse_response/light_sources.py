@@ -5,7 +5,8 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Float, Int
 
 from jaxvol import lights, sampling
 from jaxvol.methods.impulse_response import surface_paths
@@ -22,6 +23,7 @@ class Light(eqx.Module):
     distance: Float[Array, "n"]  # inf for light from infinity
     strength: Float[Array, "n 3"]  # intensity; irradiance facing it; or radiance over density
     normal: Float[Array, "n 3"] | None = None  # of area emitters
+    cone: tuple[Float[Array, "n 3"], Float[Array, "n"]] | None = None  # of spots: axis, cosine of the half angle
     infinite: bool = eqx.field(static=True, default=False)
 
 
@@ -33,6 +35,28 @@ def delta_lights(scene: Scene) -> list[tuple[str, int]]:
         if group is not None:
             found += [(kind, i) for i in range(group.direction.shape[0] if kind == "directional" else group.position.shape[0])]
     return found
+
+
+@partial(jax.jit, static_argnames=("kind", "falloff"))
+def choose(scene, position, kind, u, *, falloff: int) -> tuple[Int[Array, "n"], Float[Array, "n"]]:
+    """One of a kind of delta lights at each receiver and 1 / its probability: by its strength over distance^falloff, a
+    quarter of the times by its strength alone."""
+    group = getattr(scene, f"{kind}_lights")
+    if kind == "directional":
+        chance = jnp.broadcast_to(_shares(lights.luminance(group.irradiance)), (position.shape[0], group.direction.shape[0]))
+    else:
+        strength = lights.luminance(group.intensity)
+        delta = group.position - position[:, None]
+        near = lax.integer_pow(lax.rsqrt(jnp.maximum(dot(delta, delta), 1e-30)), falloff)
+        near = near / jnp.max(near, axis=-1, keepdims=True)
+        chance = 0.75 * _shares(strength * near) + 0.25 * _shares(strength)
+    total = jnp.cumsum(chance, axis=-1)
+    index = jnp.minimum(jnp.sum(u[:, None] * total[:, -1:] >= total, axis=-1), chance.shape[1] - 1)
+    return index, total[:, -1] / jnp.take_along_axis(chance, index[:, None], axis=-1)[:, 0]
+
+
+def _shares(weight):
+    return weight / jnp.maximum(jnp.sum(weight, axis=-1, keepdims=True), 1e-30) + 1e-6
 
 
 @partial(jax.jit, static_argnames=("kind", "scatters"))
@@ -48,9 +72,10 @@ def see(scene, position, normal, kind, index, u, *, scatters: bool) -> Light:
         distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
         direction = delta / distance[:, None]
         strength = group.intensity[index]
-        if kind == "spot":
-            strength = strength * lights.spot_falloff(group, index, -direction)[:, None]
-        return Light(direction, distance, strength)
+        if kind == "point":
+            return Light(direction, distance, strength)
+        strength = strength * lights.spot_falloff(group, index, -direction)[:, None]
+        return Light(direction, distance, strength, cone=(group.direction[index], jnp.cos(group.cutoff[index])))
     infinite = jnp.full(position.shape[0], jnp.inf, jnp.float32)
     if kind == "directional":
         group = scene.directional_lights
@@ -89,7 +114,7 @@ def see_again(scene, position, kind, index, light: Light, moved) -> Light:
     if kind == "spot":
         group = scene.spot_lights
         strength = group.intensity[index] * lights.spot_falloff(group, index, -direction)[:, None]
-    return Light(direction, distance, strength, light.normal)
+    return Light(direction, distance, strength, light.normal, light.cone)
 
 
 @jax.jit

@@ -10,8 +10,8 @@ so light scattered once is right in any medium. The second term goes on from z b
 as many `legs` as the plan says, and takes what is left from the tables at the last of them, scattered by the phase function.
 z is drawn by free flight along a uniform direction of the hemisphere. For emitters at a finite distance it is drawn in
 three ways whose densities all count (balance heuristic): uniformly in the half angles at x and y (specification 2), which
-fits the 1/r^2 of both; along a cosine-distributed direction equi-angular about the emitter, which stays inside the medium;
-and by free flight along it.
+fits the 1/r^2 of both, or for spots in their cone; along a cosine-distributed direction equi-angular about the emitter,
+which stays inside the medium; and by free flight along it.
 """
 
 from functools import partial
@@ -30,7 +30,9 @@ from jaxvol.methods.impulse_response.emitters import EXTRAPOLATION, slab_share
 from jaxvol.methods.impulse_response.light_sources import Light
 from jaxvol.sampling import dot
 
-_ANGLES, _EVEN = 0.4, 0.3  # shares of places by half angles, and equi-angular along cosine-distributed rays
+# Shares of places by half angles or in a spot's cone, and equi-angular along rays; the rest by free flight. Onward legs want
+# much of the latter: 1 / its share is the most that a leg multiplies the weight by.
+_PLACE, _ONWARD = (0.4, 0.3), (0.2, 0.2)
 _AXIS = (np.arange(8) + 0.5) / 8  # places along the segment
 _COSINES, _TURNS, _DEPTHS = (0.9, 0.5, 0.15), 4, (0.125, 0.375, 0.625, 0.875)  # directions about the normal, depths in the box
 
@@ -91,35 +93,72 @@ def place(marching, position, normal, light: Light, u, *, num_steps: int) -> Pla
         t, column, density = _free_flight(marching, position, direction, u[2], num_steps)
         return Place(direction, t, column, jnp.where(density > 0, 2 * pi / jnp.maximum(density, 1e-30), 0.0))
     above = sampling.sample_cosine_hemisphere(u[0], u[1], normal)
-    direction, t, column, rho, angles, along = _placed(marching, position, above, light, u, num_steps)
-    pdf = _ANGLES * angles + sampling.sample_cosine_hemisphere_pdf(dot(direction, normal)) * along
+    direction, t, column, rho, aimed, along = _placed(marching, position, above, light, u, num_steps, _PLACE)
+    pdf = aimed + sampling.sample_cosine_hemisphere_pdf(dot(direction, normal)) * along
     return Place(direction, t, column, rho / jnp.maximum(pdf, 1e-30))
 
 
-def _placed(marching, position, onward, light, u, num_steps):
+def _placed(marching, position, onward, light, u, num_steps, shares):
     """A point towards an emitter by one of three techniques, `onward` being the direction of two of them.
 
-    Its direction, distance, column of density and density; the pdf (solid angle, distance) of half angles; the pdf of the
-    distance by the other two, shares included.
+    Its direction, distance, column of density and density; the pdf (solid angle, distance) of the technique that aims at
+    the emitter; the pdf of the distance by the other two; `shares` included.
     """
-    by_angles, evenly = u[3] < _ANGLES, (u[3] >= _ANGLES) & (u[3] < _ANGLES + _EVEN)
-    total = 0.5 * pi * jnp.sqrt(u[0])  # a + w, uniform over the triangle a, w >= 0, a + w <= pi / 2
-    a = total * u[1]
-    reach = light.distance * jnp.sin(2 * (total - a)) / jnp.maximum(jnp.sin(2 * total), 1e-6)
-    aside = sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2])
-    direction = jnp.where(by_angles[:, None], aside, onward)
+    by_aim, by_angle = shares
+    aimed, evenly = u[3] < by_aim, (u[3] >= by_aim) & (u[3] < by_aim + by_angle)
+    bounds = marching.regions[0].bounds
     emitter = position + light.distance[:, None] * light.direction
-    t0, t1 = media.box_interval(marching.regions[0].bounds, position, direction)
+    aside, reach = (_by_half_angles if light.cone is None else _in_cone)(bounds, position, emitter, light, u)
+    direction = jnp.where(aimed[:, None], aside, onward)
+    t0, t1 = media.box_interval(bounds, position, direction)
     near, _ = sampling.sample_equiangular(u[2], position, direction, t0, t1, emitter)
-    given = jnp.where(by_angles, reach, jnp.where(evenly, near, jnp.inf))
+    given = jnp.where(aimed, reach, jnp.where(evenly, near, jnp.inf))
     t, column, density = _free_flight(marching, position, direction, u[2], num_steps, given=given)
-    rest = light.distance[:, None] * light.direction - t[:, None] * direction
-    # dt dmu dphi = (4 r^2 / d) da dw dphi, over the triangle's area and all azimuths; `density` is over density of the medium.
-    angles = light.distance / (4 * jnp.maximum(dot(rest, rest), 1e-30)) / (pi**3 / 4)
+    pdf = _by_half_angles_pdf if light.cone is None else _in_cone_pdf
+    aimed_pdf = pdf(bounds, position, emitter, light, direction, t)
     rho = extinction.region_density(marching, 0, position + t[:, None] * direction)
     even = sampling.sample_equiangular_pdf(t, position, direction, t0, t1, emitter)
-    along = _EVEN * jnp.where(t1 > t0, even, 0.0) + (1 - _ANGLES - _EVEN) * density * rho
-    return direction, t, column, rho, angles, along
+    along = by_angle * jnp.where(t1 > t0, even, 0.0) + (1 - by_aim - by_angle) * density * rho
+    return direction, t, column, rho, by_aim * aimed_pdf, along
+
+
+def _by_half_angles(bounds, position, emitter, light, u):
+    """Direction and distance of a point whose half angles a at x and w at the emitter are uniform over a + w <= pi / 2."""
+    total = 0.5 * pi * jnp.sqrt(u[0])
+    a = total * u[1]
+    reach = light.distance * jnp.sin(2 * (total - a)) / jnp.maximum(jnp.sin(2 * total), 1e-6)
+    return sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2]), reach
+
+
+def _by_half_angles_pdf(bounds, position, emitter, light, direction, t):
+    """dt dmu dphi = (4 r^2 / d) da dw dphi, over the triangle's area and all azimuths."""
+    rest = emitter - position - t[:, None] * direction
+    return light.distance / (4 * jnp.maximum(dot(rest, rest), 1e-30)) / (pi**3 / 4)
+
+
+def _in_cone(bounds, position, emitter, light, u):
+    """Direction and distance of a point in a spot's cone: a uniform direction of it, equi-angular about x."""
+    axis, cos_angle = light.cone
+    cosine = 1 - u[0] * (1 - cos_angle)
+    beam = sampling.direction_about(axis, cosine, jnp.sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0)), u[1])
+    t0, t1 = media.box_interval(bounds, emitter, beam)
+    t, _ = sampling.sample_equiangular(u[2], emitter, beam, t0, t1, position)
+    way = emitter + t[:, None] * beam - position
+    reach = jnp.sqrt(jnp.maximum(dot(way, way), 1e-30))
+    return way / reach[:, None], reach
+
+
+def _in_cone_pdf(bounds, position, emitter, light, direction, t):
+    """Of a point by `_in_cone`, in solid angle and distance from x: r^2 / r'^2 of that from the emitter."""
+    axis, cos_angle = light.cone
+    way = position + t[:, None] * direction - emitter
+    square = jnp.maximum(dot(way, way), 1e-30)
+    far = jnp.sqrt(square)
+    beam = way / far[:, None]
+    t0, t1 = media.box_interval(bounds, emitter, beam)
+    even = sampling.sample_equiangular_pdf(far, emitter, beam, t0, t1, position)
+    inside = (dot(beam, axis) >= cos_angle) & (t1 > t0)
+    return jnp.where(inside, even / (2 * pi * jnp.maximum(1 - cos_angle, 1e-7)) * t * t / square, 0.0)
 
 
 def _free_flight(marching, origin, direction, u, num_steps, given=None):
@@ -169,9 +208,9 @@ def onward(marching, points, direction, light: Light, u, *, num_steps: int):
         t, column, density = _free_flight(marching, points, turned, u[2], num_steps)
         weight = jnp.where(density > 0, 1 / jnp.maximum(density, 1e-30), 0.0)
         return turned, t, medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None]) * weight[:, None]
-    turned, t, column, rho, angles, along = _placed(marching, points, turned, light, u, num_steps)
+    turned, t, column, rho, aimed, along = _placed(marching, points, turned, light, u, num_steps, _ONWARD)
     value = phase.evaluate(medium, dot(direction, turned))
-    weight = value * rho / jnp.maximum(_ANGLES * angles + value * along, 1e-30)
+    weight = value * rho / jnp.maximum(aimed + value * along, 1e-30)
     return turned, t, medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None]) * weight[:, None]
 
 
@@ -186,7 +225,7 @@ def _phase_lobe(medium, order):
 
 @jax.jit
 def survive(
-    weight: Float[Array, "n 3"], first: Float[Array, "n 3"], free: Bool[Array, "n"], u: Float[Array, "n"], gain: float = 16.0
+    weight: Float[Array, "n 3"], first: Float[Array, "n 3"], free: Bool[Array, "n"], u: Float[Array, "n"], *, gain: float = 16.0
 ) -> Float[Array, "n 3"]:
     """Throughputs after Russian roulette on a `gain`th of a walk's first one; 0 where it lost or the way is not free."""
     chance = jnp.minimum(gain * jnp.max(weight, axis=-1) / jnp.maximum(jnp.max(first, axis=-1), 1e-30), 1.0)

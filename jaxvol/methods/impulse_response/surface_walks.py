@@ -73,4 +73,4 @@ def _leg(mesh, points, outward, t, face, tau, weight, distance, factor, first, c
     side = jnp.where(jnp.sum(hits.normal * outward, axis=-1) > 0, -1.0, 1.0)[:, None]
     reflected = surface_paths.surface_reflectance(mesh, jnp.maximum(face, 0)) / jnp.pi
     seen = jnp.where(hits.valid[:, None], weight * jnp.exp(-tau) * reflected, 0.0)
-    return seen, hits.position, hits.normal * side, marched.survive(weight * factor, first, distance < t, chance, _GAIN)
+    return seen, hits.position, hits.normal * side, marched.survive(weight * factor, first, distance < t, chance, gain=_GAIN)

@@ -73,7 +73,8 @@ def _walk(kit: Kit, normal, position, kind, index, seen, place, rows, num, draw)
         numbers, chance = take((draw(leg), draw(kit.legs + leg)[0]), lanes, num)
         outward, distance, factor = marched.onward(kit.marching, points, outward, again, numbers, num_steps=kit.num_steps)
         free = jnp.asarray(~occluded(kit, points, outward, distance))
-        weight = marched.survive(weight * factor, first, free, chance)
+        # Roulette before the leg: near a lamp its factor is small, and the next connection's 1/r^2 makes up for it.
+        weight = marched.survive(weight, first, free, chance) * factor
         points = points + distance[:, None] * outward
         alive = np.flatnonzero(np.any(np.asarray(weight)[: walks.size] > 0, axis=-1))
         if alive.size == 0:
