@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxvol import media, phase, zonal_lookup
+from jaxvol import fast_math, media, phase, zonal_lookup
 from jaxvol.types import Medium
 
 Pick = tuple[Float[Array, "*b"], Float[Array, "*b"]]
@@ -154,9 +154,9 @@ def _interpolate(grid, nodes):
 
 def angle_variable(cos_n: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """The grid's variable of the angle between a patch's normal and the way to the receiver: 1 facing, 0 edge-on, -1 behind."""
-    off = 1 - jnp.arccos(jnp.clip(cos_n, -1, 1)) * (2 / pi)
-    far = jnp.abs(off) > 1e-6
-    return jnp.where(far, jnp.sign(off) * jnp.sqrt(jnp.where(far, jnp.abs(off), 1)), 0)
+    off = 1 - fast_math.arccos_unit(jnp.minimum(jnp.abs(cos_n), 1)) * (2 / pi)
+    far = off > 1e-6
+    return jnp.where(far, jnp.sign(cos_n) * jnp.sqrt(jnp.where(far, off, 1)), 0)
 
 
 def compact_source(

@@ -1,5 +1,6 @@
 """What the method claims of a scene, and what is decided before baking."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,7 +18,7 @@ Occlusion = Literal["march", "drop"]
 _MODES = ("surface", "attenuated", "single", "multiple")
 CONTRAST = 0.5  # of density along a segment, above which it is marched
 BOUNDED = 7.0  # mean free paths across the medium, below which its bounds count everywhere
-_MOST_LEGS = 8  # of marched segments in a bounded medium, before the tables' infinite medium takes over
+_MOST_LEGS = (8, 16)  # of marched segments in a bounded medium, constant or varying, before the tables take over
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,8 @@ def plan(
         bounded: mean free paths across the thinnest side of a medium's box, below which all segments of receivers are
             integrated inside its bounds, since the tables know an infinite medium only; None = never, the paper's mode.
         legs: scatter points of a marched segment before the tables bring the rest, 1 to 64; None = in a bounded medium twice
-            the mean free paths across it, 2 to 8, else 1. More follow light around occluders and along bounds further, at the
-            price of noise.
+            the mean free paths across it, 2 to 8, where density varies by its densest place, 2 to 16; else 1. More follow light
+            around occluders and along bounds further, at the price of noise.
         similarity: the paper's map of light scattered twice or more to an isotropic medium.
         g_range: the paper's interpolation of single scattering between tables at -g_range, 0, g_range; None = moments.
         harmonics: also bake SH of incident radiance.
@@ -176,7 +177,8 @@ def plan(
     march_all = bounded is not None and across < bounded
     if march_all:
         heterogeneous = False
-        legs = legs or int(np.clip(2 * np.ceil(across), 2, _MOST_LEGS))
+        most = _MOST_LEGS[medium.density is not None]
+        legs = legs or int(np.clip(2 * np.ceil(_mean_free_paths(medium, np.max)), 2, most))
         skipped.append(f"no tables for the receivers' own segments: the medium is {across:.2g} mean free paths thick")
     elif scatters and not heterogeneous:
         skipped.append("no density varies along segments: none is marched for its contrast")
@@ -224,9 +226,9 @@ def _refuse_refraction(medium: Medium) -> None:
             )
 
 
-def _mean_free_paths(medium: Medium) -> float:
-    """Across the thinnest side of the medium's box, for its mean density and the mean of its channels."""
-    density = 1.0 if medium.density is None else float(np.mean(np.asarray(medium.density)))
+def _mean_free_paths(medium: Medium, of: Callable[[np.ndarray], float] = np.mean) -> float:
+    """Across the thinnest side of the medium's box, for its mean density (or what `of` takes) and the mean of its channels."""
+    density = 1.0 if medium.density is None else float(of(np.asarray(medium.density)))
     side = float(np.diff(np.asarray(medium.bounds, np.float64), axis=0).min())
     return float(np.mean(np.asarray(media.sigma_t(medium), np.float64))) * density * side
 

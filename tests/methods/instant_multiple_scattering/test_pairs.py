@@ -13,6 +13,8 @@ def test_polynomials_are_accurate():
     x = np.linspace(-1, 1, 20001)
     atan = np.asarray(fast_math.atan_unit(jnp.asarray(x, jnp.float32)))
     assert np.max(np.abs(atan - np.arctan(x))) < 2e-7
+    arccos = np.asarray(fast_math.arccos_unit(jnp.asarray(x[10000:], jnp.float32)))
+    assert np.max(np.abs(arccos - np.arccos(np.float32(x[10000:]).astype(float)))) < 3e-7
     y = np.linspace(-np.pi / 2, np.pi / 2, 20001)
     sin, cos = (np.asarray(v) for v in fast_math.sin_cos(jnp.asarray(y, jnp.float32)))
     assert max(np.max(np.abs(sin - np.sin(y))), np.max(np.abs(cos - np.cos(y)))) < 4e-7
