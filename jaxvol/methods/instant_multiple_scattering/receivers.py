@@ -139,17 +139,18 @@ def sample_transmittance_or_light(
     t_light, _ = sampling.sample_equiangular(u, *ray)
     chosen = jnp.where(near & to_light, t_light, t)
     pdf = sampling.sample_equiangular_pdf(chosen, *ray)
-    density, inverse = _density_and_inverse(segments, chosen, sigma)
-    mixed = density / jnp.maximum(0.5 * density / jnp.maximum(inverse, 1e-30) + 0.5 * pdf, 1e-30)
-    return chosen, jnp.where(near, jnp.where(inverse > 0, mixed, 0.0), w)
+    density, by_column, filled = _density_and_pdf(segments, chosen, sigma)
+    # Not by way of 1 / pdf, which is inf where a light is behind an optical thickness of hundreds, with a slope of NaN.
+    mixed = density / jnp.where(filled, jnp.maximum(0.5 * density * by_column + 0.5 * pdf, 1e-30), 1.0)
+    return chosen, jnp.where(near, jnp.where(filled, mixed, 0.0), w)
 
 
-def _density_and_inverse(segments, t, sigma):
-    """Density of the table's step at t, and what `sample_transmittance` would give with this t."""
+def _density_and_pdf(segments, t, sigma):
+    """Density of the table's step at t, the pdf of `sample_transmittance` at t over it, and whether there is any medium."""
     if segments.column is None:
         length = jnp.maximum(segments.t1 - segments.t0, 0.0)
         pdf = sampling.sample_truncated_exponential_pdf(t - segments.t0, sigma, length)
-        return jnp.ones_like(t), jnp.where(length > 0, 1.0 / jnp.maximum(pdf, 1e-30), 0.0)
+        return jnp.ones_like(t), pdf, length > 0
     total = segments.column[-1]
     pdf = sampling.sample_truncated_exponential_pdf(column_at(segments, t), sigma, total)
     step, _ = _step_of(segments, t)
@@ -157,7 +158,7 @@ def _density_and_inverse(segments, t, sigma):
     before = jnp.where(step > 0, segments.column[jnp.maximum(step - 1, 0), lanes], 0.0)
     length = jnp.maximum(segments.t1 - segments.t0, 1e-30)
     density = (segments.column[step, lanes] - before) * (segments.column.shape[0] / length)
-    return density, jnp.where(total > 0, 1.0 / jnp.maximum(pdf, 1e-30), 0.0)
+    return density, pdf, total > 0
 
 
 def no_surface(mesh: Mesh, n: int) -> materials.Surface:

@@ -13,7 +13,15 @@ import pytest
 
 from jaxvol import layers, lights, phase, sampling
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering import compensation, gathering, light_paths, pairs, rendering, virtual_lights
+from jaxvol.methods.instant_multiple_scattering import (
+    compensation,
+    gathering,
+    light_paths,
+    pairs,
+    receivers,
+    rendering,
+    virtual_lights,
+)
 from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLights
 from jaxvol.types import Scene
@@ -96,6 +104,29 @@ def test_gradients_through_sampling_are_finite_at_the_edges():
     for h2 in (0.0, 1e-12, 1.0):
         gradients = jax.grad(value, argnums=(0, 1))(jnp.float32(h2), jnp.float32(0.2))
         assert all(bool(jnp.isfinite(x)) for x in gradients)
+
+
+def test_gradients_of_distances_in_thick_fog_are_finite():
+    """Equi-angular distances to a light that hundreds to thousands of mean free paths hide; the weight is finite too."""
+    n = 32
+    u = (jnp.arange(n) + 0.5) / n
+    segments = receivers.Segments(
+        origin=jnp.tile(floats([0.0, 0.0, -3.0]), (n, 1)),
+        direction=jnp.tile(floats([0.0, 0.0, 1.0]), (n, 1)),
+        t0=jnp.full(n, 2.0),
+        t1=jnp.full(n, 4.0),
+        clamp=None,
+    )
+
+    def value(sigma):
+        near, light = jnp.ones(n, bool), jnp.tile(floats([0.1, 0.0, 0.0]), (n, 1))
+        t, w = receivers.sample_transmittance_or_light(segments, u, jnp.arange(n) % 2 == 0, sigma, light, near)
+        return w * jnp.exp(-sigma * (t - 2.0))
+
+    for sigma in (1e-6, 1.0, 300.0, 1e4):
+        found, slope = jax.jvp(value, (jnp.float32(sigma),), (jnp.float32(1.0),))
+        assert np.isfinite(found).all() and np.isfinite(slope).all()
+        assert float(found.mean()) == pytest.approx(-np.expm1(-2 * sigma) / sigma, rel=0.1)
 
 
 def test_phase_function_stays_below_its_peak_for_lights_on_far_rays():
