@@ -1,12 +1,14 @@
 """All runs of a benchmark file in order, each appended to results.jsonl when it is done; finished ones are not repeated."""
 
 import dataclasses
+import gc
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxvol import image, jobs, rendering
@@ -46,6 +48,8 @@ def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.S
         for task in left:
             if config.compile_threads > 1 and task.compile is not None and task.key not in firsts:
                 advance(0, note=f"{task.scene}, compiling")
+                if firsts:
+                    _forget_programs()
                 firsts |= _compile([t for t in left if t.scene == task.scene and t.compile], config.compile_threads, stop)
             if stop:
                 break
@@ -56,18 +60,34 @@ def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.S
     return [done[task.key] for task in tasks if task.key in done]
 
 
+def _forget_programs() -> None:
+    """Drop the programs of the scenes before, of which few are shared: memory, and time to collect garbage.
+
+    A run that kept those of four scenes once ended in a segmentation fault while two threads compiled the fifth's; the
+    cause was not found.
+    """
+    gc.unfreeze()
+    jax.clear_caches()
+    gc.collect()
+
+
 def _compile(tasks: list[Task], num_threads: int, stop: jobs.Stop | None) -> dict[str, First]:
     """First calls by key, of several methods at a time: XLA compiles outside Python's lock. None are begun after `stop`.
 
-    Settings of one method share programs, and two threads would compile them twice: they take turns.
+    Settings of one method share programs, and two threads would compile them twice: they take turns. Garbage is
+    collected afterwards: tracing makes little, and walking all that it keeps takes long.
     """
 
     def of_method(title: str) -> dict[str, First]:
         return {task.key: task.compile() for task in tasks if task.title == title and not stop}
 
-    with ThreadPoolExecutor(num_threads) as pool:
-        groups = pool.map(of_method, dict.fromkeys(task.title for task in tasks))
-        return {key: first for group in groups for key, first in group.items()}
+    gc.disable()
+    try:
+        with ThreadPoolExecutor(num_threads) as pool:
+            groups = pool.map(of_method, dict.fromkeys(task.title for task in tasks))
+            return {key: first for group in groups for key, first in group.items()}
+    finally:
+        gc.enable()
 
 
 def read_records(out: Path) -> dict[str, Record]:

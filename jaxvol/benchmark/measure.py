@@ -54,6 +54,7 @@ def measured(call: Callable[[int], Any], *, repeats: int, first: First | None = 
     if first.error is not None:
         raise first.error
     gc.collect()
+    gc.freeze()  # compiled programs and their traces stay: the next collection need not walk them (a second each time)
     reset_peak()
     walls, cpus, last = [], [], None
     for k in range(1, repeats + 1):
