@@ -7,7 +7,7 @@ import pytest
 
 from jaxvol import harmonics, tables, zonal_lookup
 from jaxvol.fit import assemble, table_config
-from jaxvol.methods.impulse_response import lookup, shading
+from jaxvol.methods.impulse_response import emitters, lookup, receivers, shading
 from jaxvol.types import Medium
 from tests.problems import FLOOR_IN_FOG
 
@@ -75,6 +75,26 @@ def test_floor_in_fog(name, limit, request):
     irradiance = shading.half_irradiance(once, shading.emitter_frame(axis, up), up)[:, 0]
     total = np.sum(2 * np.pi * distance * np.asarray(irradiance) * weight * 2.5 * 2 * s)
     assert total == pytest.approx(0.8 * np.pi * FLOOR_IN_FOG, rel=limit)
+
+
+def test_floor_gets_back_what_a_half_space_reflects(table):
+    """All bounces, with the image source: 1 - 2 sqrt(1 - c) int H(mu) mu dmu of its light comes back (Chandrasekhar)."""
+    c = 0.9
+    x, weight = np.polynomial.legendre.leggauss(100)
+    mu, half = 0.5 * (x + 1), 0.5 * weight
+    h = np.ones(100)
+    for _ in range(200):
+        h = 1 / (np.sqrt(1 - c) + 0.5 * c * np.sum(half * mu * h / (mu[:, None] + mu), axis=1))
+    reflected = 1 - 2 * np.sqrt(1 - c) * np.sum(half * h * mu)
+    s = mu * 60**0.5
+    distance = jnp.asarray(s * s, jnp.float32)
+    along, up = (jnp.broadcast_to(jnp.array(axis), (100, 3)) for axis in ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
+    responses = lookup.prepare(table, medium(c), grey=True, multiple=True)
+    tau = jnp.broadcast_to(distance[:, None], (100, 3))
+    arrive = jax.jit(emitters.patch_arrivals, static_argnames="image")
+    once, more = arrive(responses, receivers.Irradiance(up), along, distance, up, tau, image=True)
+    found = np.sum(2 * np.pi * s * s * np.asarray(once + more)[:, 0] * half * 60**0.5 * 2 * s) / np.pi
+    assert found == pytest.approx(reflected, rel=0.01)
 
 
 def test_single_nodes_have_the_mean_of_the_interpolation(table):
