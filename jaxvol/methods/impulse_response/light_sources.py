@@ -47,7 +47,9 @@ def choose(scene, position, kind, u, *, falloff: int) -> tuple[Int[Array, "n"], 
     else:
         strength = lights.luminance(group.intensity)
         delta = group.position - position[:, None]
-        near = lax.integer_pow(lax.rsqrt(jnp.maximum(dot(delta, delta), 1e-30)), falloff)
+        square = dot(delta, delta)
+        square = jnp.where(square < 1e30, square, 1e30)  # paths that have left the scene are nowhere
+        near = lax.integer_pow(lax.rsqrt(jnp.maximum(square, 1e-30)), falloff)
         near = near / jnp.max(near, axis=-1, keepdims=True)
         chance = 0.75 * _shares(strength * near) + 0.25 * _shares(strength)
     total = jnp.cumsum(chance, axis=-1)

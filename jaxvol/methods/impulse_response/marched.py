@@ -95,7 +95,12 @@ def place(marching, position, normal, light: Light, u, *, num_steps: int) -> Pla
     above = sampling.sample_cosine_hemisphere(u[0], u[1], normal)
     direction, t, column, rho, aimed, along = _placed(marching, position, above, light, u, num_steps, _PLACE)
     pdf = aimed + sampling.sample_cosine_hemisphere_pdf(dot(direction, normal)) * along
-    return Place(direction, t, column, rho / jnp.maximum(pdf, 1e-30))
+    return Place(direction, t, column, _over(rho, pdf))
+
+
+def _over(value, pdf):
+    """value / pdf; 0 where the pdf has underflowed, which only places that light does not reach have."""
+    return jnp.where(pdf > 1e-30, value / jnp.maximum(pdf, 1e-30), 0.0)
 
 
 def _placed(marching, position, onward, light, u, num_steps, shares):
@@ -108,14 +113,15 @@ def _placed(marching, position, onward, light, u, num_steps, shares):
     aimed, evenly = u[3] < by_aim, (u[3] >= by_aim) & (u[3] < by_aim + by_angle)
     bounds = marching.regions[0].bounds
     emitter = position + light.distance[:, None] * light.direction
-    aside, reach = (_by_half_angles if light.cone is None else _in_cone)(bounds, position, emitter, light, u)
+    aside, reach, drawn = (_by_half_angles if light.cone is None else _in_cone)(bounds, position, emitter, light, u)
     direction = jnp.where(aimed[:, None], aside, onward)
     t0, t1 = media.box_interval(bounds, position, direction)
     near, _ = sampling.sample_equiangular(u[2], position, direction, t0, t1, emitter)
     given = jnp.where(aimed, reach, jnp.where(evenly, near, jnp.inf))
     t, column, density = _free_flight(marching, position, direction, u[2], num_steps, given=given)
     pdf = _by_half_angles_pdf if light.cone is None else _in_cone_pdf
-    aimed_pdf = pdf(bounds, position, emitter, light, direction, t)
+    # The sampler's own pdf where it drew: rounding at the cone's edge must not turn it into none.
+    aimed_pdf = jnp.where(aimed, drawn, pdf(bounds, position, emitter, light, direction, t))
     rho = extinction.region_density(marching, 0, position + t[:, None] * direction)
     even = sampling.sample_equiangular_pdf(t, position, direction, t0, t1, emitter)
     along = by_angle * jnp.where(t1 > t0, even, 0.0) + (1 - by_aim - by_angle) * density * rho
@@ -123,11 +129,12 @@ def _placed(marching, position, onward, light, u, num_steps, shares):
 
 
 def _by_half_angles(bounds, position, emitter, light, u):
-    """Direction and distance of a point whose half angles a at x and w at the emitter are uniform over a + w <= pi / 2."""
+    """Direction, distance and pdf of a point whose half angles a at x and w at the emitter are uniform over a + w <= pi / 2."""
     total = 0.5 * pi * jnp.sqrt(u[0])
     a = total * u[1]
     reach = light.distance * jnp.sin(2 * (total - a)) / jnp.maximum(jnp.sin(2 * total), 1e-6)
-    return sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2]), reach
+    direction = sampling.direction_about(light.direction, jnp.cos(2 * a), jnp.sin(2 * a), u[2])
+    return direction, reach, _by_half_angles_pdf(bounds, position, emitter, light, direction, reach)
 
 
 def _by_half_angles_pdf(bounds, position, emitter, light, direction, t):
@@ -137,15 +144,16 @@ def _by_half_angles_pdf(bounds, position, emitter, light, direction, t):
 
 
 def _in_cone(bounds, position, emitter, light, u):
-    """Direction and distance of a point in a spot's cone: a uniform direction of it, equi-angular about x."""
+    """Direction, distance and pdf of a point in a spot's cone: a uniform direction of it, equi-angular about x."""
     axis, cos_angle = light.cone
     cosine = 1 - u[0] * (1 - cos_angle)
     beam = sampling.direction_about(axis, cosine, jnp.sqrt(jnp.maximum((1 - cosine) * (1 + cosine), 0.0)), u[1])
     t0, t1 = media.box_interval(bounds, emitter, beam)
-    t, _ = sampling.sample_equiangular(u[2], emitter, beam, t0, t1, position)
+    t, even = sampling.sample_equiangular(u[2], emitter, beam, t0, t1, position)
     way = emitter + t[:, None] * beam - position
     reach = jnp.sqrt(jnp.maximum(dot(way, way), 1e-30))
-    return way / reach[:, None], reach
+    pdf = even / (2 * pi * jnp.maximum(1 - cos_angle, 1e-7)) * (reach / jnp.maximum(t, 1e-30)) * (reach / jnp.maximum(t, 1e-30))
+    return way / reach[:, None], reach, jnp.where(t1 > t0, pdf, 0.0)
 
 
 def _in_cone_pdf(bounds, position, emitter, light, direction, t):
@@ -210,7 +218,7 @@ def onward(marching, points, direction, light: Light, u, *, num_steps: int):
         return turned, t, medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None]) * weight[:, None]
     turned, t, column, rho, aimed, along = _placed(marching, points, turned, light, u, num_steps, _ONWARD)
     value = phase.evaluate(medium, dot(direction, turned))
-    weight = value * rho / jnp.maximum(aimed + value * along, 1e-30)
+    weight = _over(value * rho, aimed + value * along)
     return turned, t, medium.sigma_s * jnp.exp(-media.sigma_t(medium) * column[:, None]) * weight[:, None]
 
 
