@@ -20,7 +20,7 @@ from jaxvol.methods.impulse_response.light_sources import Light
 from jaxvol.methods.impulse_response.walks import Draw, ranks, take
 
 _GAIN = 0.75  # of the chance to go on, over what is left of the throughput: fewer lanes for little noise
-_ONWARD = 8  # scatter points after those of lamps' walks; roulette ends nearly all before
+_ONWARD = 56  # scatter points after those of lamps' walks; roulette ends nearly all before
 
 
 class Walks(NamedTuple):
