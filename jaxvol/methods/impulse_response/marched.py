@@ -80,7 +80,7 @@ def contrast(
             for depth in _DEPTHS:
                 inside = density(position + (t0 + depth * (t1 - t0))[:, None] * way)
                 found.append(jnp.where(t1 > t0, inside, 0.0))
-    values = jnp.stack(found)
+    values = lax.stop_gradient(jnp.stack(found))  # for a decision only
     high, low = jnp.max(values, axis=0), jnp.min(values, axis=0)
     return jnp.where(high > 0, (high - low) / jnp.maximum(high, 1e-30), 1.0)
 
@@ -123,6 +123,7 @@ def _placed(marching, position, onward, light, u, num_steps, shares):
     # The sampler's own pdf where it drew: rounding at the cone's edge must not turn it into none.
     aimed_pdf = jnp.where(aimed, drawn, pdf(bounds, position, emitter, light, direction, t))
     rho = extinction.region_density(marching, 0, position + t[:, None] * direction)
+    rho = jnp.where(t1 > t0, rho, 0.0)  # ways that leave the box at once have no place on them
     even = sampling.sample_equiangular_pdf(t, position, direction, t0, t1, emitter)
     along = by_angle * jnp.where(t1 > t0, even, 0.0) + (1 - by_aim - by_angle) * density * rho
     return direction, t, column, rho, by_aim * aimed_pdf, along

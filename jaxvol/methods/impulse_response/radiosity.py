@@ -19,7 +19,7 @@ from jaxvol.methods.impulse_response.receivers import Irradiance
 NUM_POINTS = 2048  # at most
 _SAMPLES = 16  # of own light and of steps, at each point
 _FEWEST = 64  # points below which walking on is as good
-_WORTH = 4  # paths of the bake for each sample in the cache, below which it costs more than it saves
+_WORTH = 1  # paths of the bake for each sample in the cache, below which it costs more than it saves
 
 
 def cached(kit: Kit, points: np.ndarray, normals: np.ndarray, plan: Plan, *, num_paths: int, seed: int) -> Kit:
