@@ -49,8 +49,11 @@ def bake(
     With `share` > 1 one of so many receivers has light that met surface or medium computed, the others interpolate it
     (`sharing`), by samples sqrt(share) paths, about where noise per time is least; light straight from emitters is computed
     at all, by `samples`. Biased then where light bends within a group of receivers.
-    `on_progress` gets the number of receivers that were finished. Raises `Interrupted` between parts once `stop` is set.
+    `on_progress` gets the number of receivers that were finished. Raises `Interrupted` between parts once `stop` is set,
+    ValueError for `share` < 1.
     """
+    if share < 1:
+        raise ValueError(f"share: {share} is not allowed, must be >= 1")
     more = round(samples * np.sqrt(share))
     kit = radiosity.cached(kit, points, normals, plan, num_paths=more * len(points) // share, seed=seed)
     job = _Job(plan, samples, seed, parts, stop)

@@ -1,8 +1,8 @@
 """Stage 3, shared receivers: reflected and scattered light at a few of them, interpolated to all; direct light at each.
 
 Light that has met a surface or the medium is smooth over surfaces (Ward, Rubinstein and Clear 1988; the paper's game
-pipeline bakes it at the texels of coarse maps). Locally linear regression in the tangent plane gives the weights, so that
-linear light is exact; nothing is taken from behind walls, other planes, or receivers that a surface hides.
+pipeline bakes it at the texels of coarse maps). Locally linear regression in the tangent plane gives the weights, damped
+where it would multiply noise; nothing is taken from behind walls, other planes, or receivers that a surface hides.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from jaxvol import ray_casting
+from jaxvol import ray_casting, sampling
 
 _NEIGHBOURS, _RAYS = 12, 12
 _REACH = 3.0  # of the cells' side: where a neighbour's weight ends
@@ -87,7 +87,7 @@ def _weights(points, normals, rows, side, caster):
     if caster is not None:
         serves &= ~_hidden(points, normals, there, facing, side, caster)
     near = np.where(serves, near, 0)
-    s, t = _frame(normals)
+    s, t = (np.asarray(axis, np.float64) for axis in sampling.orthonormal_basis(np.float32(normals)))
     basis = np.stack([np.ones_like(off), np.einsum("nkd,nd->nk", delta, s), np.einsum("nkd,nd->nk", delta, t)], axis=2)
     total = near.sum(axis=1)
     moments = np.einsum("nk,nki,nkj->nij", near, basis, basis)
@@ -97,17 +97,10 @@ def _weights(points, normals, rows, side, caster):
     return neighbours, near * np.einsum("nki,ni->nk", basis, plane)
 
 
-def _frame(normals):
-    """Two unit tangents of each normal."""
-    s = np.cross(normals, np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]]))
-    s /= np.linalg.norm(s, axis=1, keepdims=True)
-    return s, np.cross(normals, s)
-
-
 def _openness(points, normals, side, caster):
     """Harmonic mean distance of what each receiver sees (Ward's split sphere), along twelve directions."""
     lift = 1e-3 * side
-    s, t = _frame(normals)
+    s, t = (np.asarray(axis, np.float64) for axis in sampling.orthonormal_basis(np.float32(normals)))
     closeness = np.zeros(len(points))
     far = np.full(len(points), np.inf, np.float32)
     for i in range(_RAYS):

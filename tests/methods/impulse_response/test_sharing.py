@@ -127,6 +127,8 @@ def test_shared_bake_adds_up():
     points, normals = inside(scene, 48)
     plan = impulse_response.plan(scene, None, harmonics=True, max_bounces=2)
     kit = impulse_response.prepare(scene, plan)
+    with pytest.raises(ValueError, match="share: 0 is not allowed"):
+        baking.bake(kit, plan, points, normals, name="none", samples=1, share=0)
     full = baking.bake(kit, plan, points, normals, name="full", samples=32)
     shared = baking.bake(kit, plan, points, normals, name="shared", samples=32, share=8)
     np.testing.assert_array_equal(full.irradiance["surface_from_light"], shared.irradiance["surface_from_light"])
