@@ -74,10 +74,12 @@ def _placeholder() -> Callable[[], None]:
 
 
 def configure_jax() -> None:
-    """Quiet logs and a compilation cache that survives the process. Must run before jax is imported."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    import jax
+    """Quiet logs and a compilation cache that survives the process, and serves those that it starts.
 
+    By environment variables, which jax reads when it is imported; where they are set already, they stay.
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # hundreds of small programs make seconds
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxvol"
@@ -85,8 +87,7 @@ def configure_jax() -> None:
         cache.mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # a home that cannot be written: compile every time
-    jax.config.update("jax_compilation_cache_dir", str(cache))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # hundreds of small programs make seconds
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
 
 
 def _one_line(error: BaseException) -> str:

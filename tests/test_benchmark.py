@@ -1,21 +1,24 @@
 """The benchmark: its files, what it measures, its tables against numbers worked out by hand, and that it goes on."""
 
 import json
+import math
+import os
+from functools import partial
 
 import numpy as np
 import pytest
 
 from jaxvol import image, layers
-from jaxvol.benchmark import driver, errors, measure, report, runners
+from jaxvol.benchmark import driver, errors, measure, report, runners, workers
 from jaxvol.benchmark.config import BenchmarkTable, ReferenceTable, load_config
 from jaxvol.benchmark.references import reference, reference_path
+from jaxvol.jobs import Stop
 from jaxvol.types import Layers
 from tests.test_cli import SCENE, run
 
 CONFIG = """
 repeats = 1
 block = 2
-compile_threads = 2
 [reference]
 seconds = 0.5
 [mitsuba]
@@ -187,6 +190,35 @@ def test_measured_counts_warm_calls_only():
     before = measure.peak_mib()
     block = np.ones(16 << 20)  # 128 MiB
     assert measure.peak_mib() >= before + 100 and block.size
+
+
+def test_workers_share_calls_and_say_when_one_ends():
+    with workers.Workers(2) as several:
+        found = several.spread([os.getpid] * 5)
+        pids = dict(found)
+        assert len(pids) == 2 and os.getpid() not in pids.values() and {pids[k] for k, _ in found} == set(pids.values())
+        assert several.call(1, os.getpid) == pids[1]
+        with pytest.raises(ValueError, match="factorial"):
+            several.call(0, partial(math.factorial, -1))
+        with pytest.raises(RuntimeError, match=r"exit code 3\); the same command goes on"):
+            several.call(1, partial(os._exit, 3))
+        assert several.call(0, os.getpid) == pids[0]
+    stop = Stop()
+    with workers.Workers(1) as one:
+        assert one.spread([os.getpid, partial(setattr, stop, "requested", True), os.getpid], stop) == [
+            (0, os.getpid()), (0, None), None,
+        ]  # fmt: skip
+
+
+def test_a_composite_takes_turns_with_its_methods_in_one_worker():
+    def task(method, seconds=1.0, uses=()):
+        return driver.Task(method, "s", method, run=None, compile=partial(measure.First, seconds), uses=uses)
+
+    tasks = [task("a", 2.0), task("a", 0.5), task("b"), task("c"), task("auto", uses=("a", "c"))]
+    took = {}
+    with workers.Workers(1) as one:
+        made = driver._first_calls(tasks, one, took, None)
+    assert took == {"auto": 4.5, "b": 1.0} and made["b"] == (0, measure.First(1.0)) and set(made) == {"a", "b", "c", "auto"}
 
 
 @pytest.mark.parametrize(

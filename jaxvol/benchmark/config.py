@@ -81,7 +81,7 @@ class BenchmarkTable(Table):
     scaling: tuple[ScalingEntry, ...] = ()
     reference: ReferenceTable = Field(default_factory=ReferenceTable)
     mitsuba: PeerTable = Field(default_factory=PeerTable)
-    compile_threads: int = Field(1, ge=1, le=64)  # first calls made at a time, before any warm call of the scene is timed
+    processes: int = Field(1, ge=1, le=64)  # that make first calls, all at a time; what is timed runs alone
     repeats: int = Field(3, ge=1)  # warm runs, of which the median counts
     block: int = Field(4, ge=1)  # pixels a side, over which relative L1 and p99 are averaged
     seed: int = Field(1, ge=0)

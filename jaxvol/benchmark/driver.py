@@ -4,18 +4,18 @@ import dataclasses
 import gc
 import json
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxvol import image, jobs, rendering
 from jaxvol.benchmark import errors, peer, runners
 from jaxvol.benchmark.config import BenchmarkTable, MethodEntry, ScalingEntry, SceneEntry, Settings, scene_name
-from jaxvol.benchmark.measure import First
+from jaxvol.benchmark.measure import First, forget_programs
 from jaxvol.benchmark.references import reference
+from jaxvol.benchmark.workers import Workers
 from jaxvol.layers import NAMES
 from jaxvol.methods import path_tracing
 from jaxvol.scene import SceneFile
@@ -27,13 +27,14 @@ PEER = "mitsuba"
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """One line of results.jsonl: what is run and what names it."""
+    """One line of results.jsonl: what is run, for which worker, and what names it."""
 
     key: str
-    title: str
-    run: Callable[[First | None], Record]
-    scene: str = ""
+    scene: str
+    method: str
+    run: Callable[[First | None], Record]  # picklable, as is `compile`
     compile: Callable[[], First] | None = None  # the first call alone, where it may be made beside others
+    uses: tuple[str, ...] = ()  # other methods whose programs it needs too
 
 
 def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.Stop | None = None) -> list[Record]:
@@ -42,50 +43,55 @@ def run_benchmark(config: BenchmarkTable, base: Path, out: Path, *, stop: jobs.S
     done = read_records(out)
     tasks = list(_tasks(config, base, out))
     left = [task for task in tasks if task.key not in done]
-    with jobs.progress("benchmark", total=len(tasks)) as advance:
+    with Workers(config.processes if left else 1) as workers, jobs.progress("benchmark", total=len(tasks)) as advance:
         advance(len(tasks) - len(left))
-        firsts: dict[str, First] = {}
+        scene, made, took = None, {}, {}
         for task in left:
-            if config.compile_threads > 1 and task.compile is not None and task.key not in firsts:
-                advance(0, note=f"{task.scene}, compiling")
-                if firsts:
-                    _forget_programs()
-                firsts |= _compile([t for t in left if t.scene == task.scene and t.compile], config.compile_threads, stop)
             if stop:
                 break
-            record = {"key": task.key} | task.run(firsts.get(task.key))
-            done[task.key] = record
+            if task.scene != scene:
+                scene = task.scene
+                advance(0, note=f"{scene}, first calls")
+                workers.call_all(forget_programs)
+                made = _first_calls([t for t in left if t.scene == scene and t.compile], workers, took, stop)
+            if stop:
+                break
+            worker, first = made.get(task.key, (0, None))
+            done[task.key] = {"key": task.key} | workers.call(worker, partial(task.run, first))
             _write(out, done)
-            advance(1, note=task.title)
+            advance(1, note=f"{task.scene}, {task.method}")
     return [done[task.key] for task in tasks if task.key in done]
 
 
-def _forget_programs() -> None:
-    """Drop the programs of the scenes before, of which few are shared: memory, and time to collect garbage.
+def _first_calls(
+    tasks: list[Task], workers: Workers, took: dict[str, float], stop: jobs.Stop | None
+) -> dict[str, tuple[int, First]]:
+    """(worker, first call) by key. Settings of one method, and a composite with its methods, take turns in one worker.
 
-    A run that kept those of four scenes once ended in a segmentation fault while two threads compiled the fifth's; the
-    cause was not found.
+    Longest first, by what they `took` in the scene before.
     """
-    gc.unfreeze()
-    jax.clear_caches()
-    gc.collect()
+    teams: dict[str, str] = {}
+    for task in tasks:
+        teams |= dict.fromkeys((task.method, *task.uses), task.method)
+    groups: dict[str, list[Task]] = {}
+    for task in tasks:
+        groups.setdefault(teams[task.method], []).append(task)
+    order = sorted(groups.values(), key=lambda group: -took.get(group[-1].method, np.inf))
+    found = {}
+    results = workers.spread([partial(_compile, tuple(task.compile for task in group)) for group in order], stop)
+    for group, result in zip(order, results, strict=True):
+        if result is not None:
+            worker, firsts = result
+            took[group[-1].method] = sum(first.seconds for first in firsts)
+            found |= {task.key: (worker, first) for task, first in zip(group, firsts, strict=True)}
+    return found
 
 
-def _compile(tasks: list[Task], num_threads: int, stop: jobs.Stop | None) -> dict[str, First]:
-    """First calls by key, of several methods at a time: XLA compiles outside Python's lock. None are begun after `stop`.
-
-    Settings of one method share programs, and two threads would compile them twice: they take turns. Garbage is
-    collected afterwards: tracing makes little, and walking all that it keeps takes long.
-    """
-
-    def of_method(title: str) -> dict[str, First]:
-        return {task.key: task.compile() for task in tasks if task.title == title and not stop}
-
+def _compile(calls: tuple[Callable[[], First], ...]) -> list[First]:
+    """First calls, one after the other. Garbage is collected later: tracing makes little, walking what it keeps takes long."""
     gc.disable()
     try:
-        with ThreadPoolExecutor(num_threads) as pool:
-            groups = pool.map(of_method, dict.fromkeys(task.title for task in tasks))
-            return {key: first for group in groups for key, first in group.items()}
+        return [call() for call in calls]
     finally:
         gc.enable()
 
@@ -130,13 +136,16 @@ def _tasks(config: BenchmarkTable, base: Path, out: Path) -> Iterator[Task]:
                 key = jobs.config_hash(
                     told | {"method": method.model_dump(exclude={"settings", "curves"}), "settings": settings}
                 )
-                run, compile = _method_task(config, base, out, entry, method, index, settings)
-                yield Task(key, f"{file.name}, {method.name}", run, file.name, compile)
+                call = partial(_run_method, config, base, out, entry, method, index, settings)
+                first = None if method.entry else partial(_compile_method, config, base, entry, method, settings)
+                uses = _used(entry, base, settings) if _method(method) == "auto" else ()
+                yield Task(key, file.name, method.name, call, first, uses)
         if config.mitsuba.enabled and entry.peer and peer.installed():
             for samples in config.mitsuba.samples:
                 peers = {"integrator": entry.peer_integrator, "scale": entry.peer_scale, "batches": config.mitsuba.batches}
                 key = jobs.config_hash(told | {"method": PEER, "samples": samples} | peers)
-                yield Task(key, f"{file.name}, {PEER}", _peer_task(config, base, out, entry, samples))
+                call = partial(_run_peer, config, base, out, entry, samples)
+                yield Task(key, file.name, PEER, call, partial(_compile_peer, config, base, entry, samples))
     for scaling in config.scaling:
         entry = next((s for s in config.scenes if scene_name(s) == scaling.scene), None)
         if entry is None:
@@ -144,7 +153,9 @@ def _tasks(config: BenchmarkTable, base: Path, out: Path) -> Iterator[Task]:
         for value in scaling.values:
             told = {"scaling": scaling.model_dump(exclude={"values"}), "value": value, "entry": entry.model_dump()}
             key = jobs.config_hash(told | {"repeats": config.repeats, "versions": rendering.versions()})
-            yield Task(key, f"{scaling.name} {value}", _scaling_task(config, base, entry, scaling, value))
+            yield Task(
+                key, scaling.name, f"{scaling.method} {value}", partial(_run_scaling, config, base, entry, scaling, value)
+            )
 
 
 def _told(file: Any, entry: SceneEntry, config: BenchmarkTable) -> Record:
@@ -154,82 +165,93 @@ def _told(file: Any, entry: SceneEntry, config: BenchmarkTable) -> Record:
     }  # fmt: skip
 
 
-def _method_task(
-    config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry, method: MethodEntry, index: int, settings: Settings
-) -> tuple[Callable[[First | None], Record], Callable[[], First] | None]:
-    """The run, and its first call alone for methods of ours."""
-    name = method.method or method.name
-
-    def load() -> SceneFile:
-        return runners.load_file(entry, base, overrides=() if method.entry else runners.as_overrides(name, settings))
-
-    def compile() -> First:
-        try:
-            file = load()
-        except ValueError as error:
-            return First(0.0, error)
-        return runners.compile_method(file, name, seed=config.seed)
-
-    def run(first: First | None) -> Record:
-        record = {"method": method.name, "settings": settings, "index": index}
-        try:
-            file = load()
-            record = _told(file, entry, config) | record
-            right = reference(runners.load_file(entry, base), config.reference, out / "references")
-            if method.entry is None:
-                found = runners.run_method(file, name, repeats=config.repeats, seed=config.seed, first=first)
-            else:
-                function = runners.load_function(method.entry)
-                found = runners.run_function(file, method, function, repeats=config.repeats, seed=config.seed)
-        except ValueError as error:
-            return record | {"refused": str(error)}
-        record |= _costs(found.cost) | {"seconds": found.seconds} | found.about
-        record["errors"] = errors.all_errors(found.estimate.mean, right, block=config.block)
-        record["names"] = list(errors.names_of(found.estimate.mean))
-        record["lit"] = list(errors.lit(NAMES, right))
-        picture = out / "pictures" / f"{file.name}.{method.name}.{index}.exr"
-        image.write_exr(picture, image.estimate_channels(found.estimate), metadata=record)
-        return record | {"picture": str(picture.relative_to(out))}
-
-    shares_programs = name == "auto"  # with all others: compiled after them
-    return run, None if method.entry or shares_programs else compile
+def _method(method: MethodEntry) -> str:
+    return method.method or method.name
 
 
-def _peer_task(
-    config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry, samples: int
-) -> Callable[[First | None], Record]:
-    def run(_: First | None) -> Record:
-        file = runners.load_file(entry, base)
-        record = _told(file, entry, config) | {"method": PEER, "settings": {"samples": samples}, "index": 0}
-        right = reference(file, config.reference, out / "references")
-        try:
-            found = peer.run_peer(file, entry, config.mitsuba, samples=samples, seed=config.seed)
-        except ValueError as error:
-            return record | {"refused": str(error)}
-        noise = errors.relmse_of_noise(found.variance, right.rgb)
-        against = image.bias(found.mean.astype(np.float32), right.rgb)
-        seconds = {"plan": 0.0, "compile": max(found.cost.first_seconds - found.cost.seconds, 0.0), "run": found.cost.seconds}
-        record |= _costs(found.cost) | {"seconds": seconds, "lit": list(errors.lit(NAMES, right)), "names": list(NAMES)}
-        return record | {"errors": {"own": {"relmse": noise, "relmse_error": 0.0, "bias": against}}}
-
-    return run
+def _load(entry: SceneEntry, base: Path, method: MethodEntry, settings: Settings) -> SceneFile:
+    return runners.load_file(entry, base, overrides=() if method.entry else runners.as_overrides(_method(method), settings))
 
 
-def _scaling_task(
-    config: BenchmarkTable, base: Path, entry: SceneEntry, scaling: ScalingEntry, value: int
-) -> Callable[[First | None], Record]:
-    def run(_: First | None) -> Record:
-        overrides = tuple(text.replace("{n}", str(value)) for text in scaling.overrides)
-        file = runners.load_file(entry, base, overrides=overrides)
-        record = _told(file, entry, config) | {"scaling": scaling.name, "method": scaling.method, "value": value}
-        if scaling.method == "bake":
-            cost, count = runners.run_bake(file, texels=value, repeats=config.repeats, seed=config.seed)
+def _used(entry: SceneEntry, base: Path, settings: Settings) -> tuple[str, ...]:
+    """The methods that "auto" puts together; none where it refuses the scene."""
+    try:
+        file = runners.load_file(entry, base, overrides=runners.as_overrides("auto", settings))
+        return tuple(share.method for share in rendering.assign(file, automatic=True).shares)
+    except ValueError:
+        return ()
+
+
+def _compile_method(config: BenchmarkTable, base: Path, entry: SceneEntry, method: MethodEntry, settings: Settings) -> First:
+    try:
+        file = _load(entry, base, method, settings)
+    except ValueError as error:
+        return First(0.0, error)
+    return runners.compile_method(file, _method(method), seed=config.seed)
+
+
+def _run_method(
+    config: BenchmarkTable,
+    base: Path,
+    out: Path,
+    entry: SceneEntry,
+    method: MethodEntry,
+    index: int,
+    settings: Settings,
+    first: First | None,
+) -> Record:
+    record = {"method": method.name, "settings": settings, "index": index}
+    try:
+        file = _load(entry, base, method, settings)
+        record = _told(file, entry, config) | record
+        right = reference(runners.load_file(entry, base), config.reference, out / "references")
+        if method.entry is None:
+            found = runners.run_method(file, _method(method), repeats=config.repeats, seed=config.seed, first=first)
         else:
-            cost = runners.run_method(file, scaling.method, repeats=config.repeats, seed=config.seed).cost
-            count = value**scaling.power
-        return record | _costs(cost) | {"count": count, "seconds": {"run": cost.seconds}}
+            function = runners.load_function(method.entry)
+            found = runners.run_function(file, method, function, repeats=config.repeats, seed=config.seed)
+    except ValueError as error:
+        return record | {"refused": str(error)}
+    record |= _costs(found.cost) | {"seconds": found.seconds} | found.about
+    record["errors"] = errors.all_errors(found.estimate.mean, right, block=config.block)
+    record["names"] = list(errors.names_of(found.estimate.mean))
+    record["lit"] = list(errors.lit(NAMES, right))
+    picture = out / "pictures" / f"{file.name}.{method.name}.{index}.exr"
+    image.write_exr(picture, image.estimate_channels(found.estimate), metadata=record)
+    return record | {"picture": str(picture.relative_to(out))}
 
-    return run
+
+def _compile_peer(config: BenchmarkTable, base: Path, entry: SceneEntry, samples: int) -> First:
+    return peer.compile_peer(runners.load_file(entry, base), entry, samples=samples, seed=config.seed)
+
+
+def _run_peer(config: BenchmarkTable, base: Path, out: Path, entry: SceneEntry, samples: int, first: First | None) -> Record:
+    file = runners.load_file(entry, base)
+    record = _told(file, entry, config) | {"method": PEER, "settings": {"samples": samples}, "index": 0}
+    right = reference(file, config.reference, out / "references")
+    try:
+        found = peer.run_peer(file, entry, config.mitsuba, samples=samples, seed=config.seed, first=first)
+    except ValueError as error:
+        return record | {"refused": str(error)}
+    noise = errors.relmse_of_noise(found.variance, right.rgb)
+    against = image.bias(found.mean.astype(np.float32), right.rgb)
+    seconds = {"plan": 0.0, "compile": max(found.cost.first_seconds - found.cost.seconds, 0.0), "run": found.cost.seconds}
+    record |= _costs(found.cost) | {"seconds": seconds, "lit": list(errors.lit(NAMES, right)), "names": list(NAMES)}
+    return record | {"errors": {"own": {"relmse": noise, "relmse_error": 0.0, "bias": against}}}
+
+
+def _run_scaling(
+    config: BenchmarkTable, base: Path, entry: SceneEntry, scaling: ScalingEntry, value: int, _: First | None
+) -> Record:
+    overrides = tuple(text.replace("{n}", str(value)) for text in scaling.overrides)
+    file = runners.load_file(entry, base, overrides=overrides)
+    record = _told(file, entry, config) | {"scaling": scaling.name, "method": scaling.method, "value": value}
+    if scaling.method == "bake":
+        cost, count = runners.run_bake(file, texels=value, repeats=config.repeats, seed=config.seed)
+    else:
+        cost = runners.run_method(file, scaling.method, repeats=config.repeats, seed=config.seed).cost
+        count = value**scaling.power
+    return record | _costs(cost) | {"count": count, "seconds": {"run": cost.seconds}}
 
 
 def _costs(cost: Any) -> Record:

@@ -12,8 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+
 _STATUS = Path("/proc/self/status")
 _CLEAR = Path("/proc/self/clear_refs")
+_MAPS = Path("/proc/self/maps")
+_MANY_MAPS = 16_000  # Linux allows a process 65,530; every program takes several
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,14 @@ def measured(call: Callable[[int], Any], *, repeats: int, first: First | None = 
         cpus.append(time.process_time() - cpu)
     cost = Cost(first.seconds, statistics.median(walls), statistics.median(cpus), peak_mib(), os.getloadavg()[0])
     return last, cost
+
+
+def forget_programs() -> None:
+    """Drop compiled programs where there are very many, of scenes before: they keep memory and memory maps."""
+    if not _MAPS.exists() or _MAPS.read_bytes().count(b"\n") > _MANY_MAPS:
+        gc.unfreeze()
+        jax.clear_caches()
+        gc.collect()
 
 
 def reset_peak() -> None:

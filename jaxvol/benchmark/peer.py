@@ -4,6 +4,7 @@ import importlib.util
 import os
 import re
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from jaxvol import mitsuba_export, mitsuba_phong
 from jaxvol.benchmark.config import PeerTable, SceneEntry
-from jaxvol.benchmark.measure import Cost, measured
+from jaxvol.benchmark.measure import Cost, First, first_call, measured
 from jaxvol.scene import SceneFile
 
 _LEAST_LLVM = 19  # 19 and 22 work, 14 and 15 abort ("Cannot select: fmaximum")
@@ -47,8 +48,8 @@ def choose_variant() -> str:
     return "llvm_ad_rgb"
 
 
-def run_peer(file: SceneFile, entry: SceneEntry, settings: PeerTable, *, samples: int, seed: int) -> PeerRun:
-    """`batches` pictures of `samples` samples a pixel. Raises ValueError for scenes that Mitsuba cannot express."""
+def _render(file: SceneFile, entry: SceneEntry, samples: int, seed: int) -> Callable[[int], np.ndarray]:
+    """A function that renders picture k. Raises ValueError for scenes that Mitsuba cannot express."""
     import mitsuba
 
     if mitsuba.variant() is None:
@@ -59,11 +60,23 @@ def run_peer(file: SceneFile, entry: SceneEntry, settings: PeerTable, *, samples
             file.scene, file.camera, folder, integrator=entry.peer_integrator, scale=entry.peer_scale
         )
         loaded = mitsuba.load_dict(described)
-    pictures = []
+    return lambda k: np.array(mitsuba.render(loaded, seed=seed + 1000 + k, spp=samples), np.float64)
+
+
+def compile_peer(file: SceneFile, entry: SceneEntry, *, samples: int, seed: int) -> First:
+    """The first picture, for which Mitsuba compiles a kernel that it keeps."""
+    return first_call(lambda k: _render(file, entry, samples, seed)(k))
+
+
+def run_peer(
+    file: SceneFile, entry: SceneEntry, settings: PeerTable, *, samples: int, seed: int, first: First | None = None
+) -> PeerRun:
+    """`batches` pictures of `samples` samples a pixel. Raises ValueError for scenes that Mitsuba cannot express."""
+    render, pictures = _render(file, entry, samples, seed), []
 
     def call(k: int) -> None:
-        pictures.append(np.array(mitsuba.render(loaded, seed=seed + 1000 + k, spp=samples), np.float64))
+        pictures.append(render(k))
 
-    _, cost = measured(call, repeats=settings.batches)
-    batches = np.stack(pictures[1:])
+    _, cost = measured(call, repeats=settings.batches, first=first)
+    batches = np.stack(pictures[-settings.batches :])
     return PeerRun(samples, batches.mean(axis=0), batches.var(axis=0, ddof=1), cost)
