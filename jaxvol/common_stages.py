@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxvol import camera as cameras
-from jaxvol import extinction, ray_casting, segments
+from jaxvol import extinction, pixel_edges, ray_casting, segments
 from jaxvol.types import Camera, Rays, Scene
 
 
 class CommonStages:
-    """Casters, corner tables of the grids, rays through the pixels' centres and their first hits; eager."""
+    """Casters, corner tables of the grids, rays through the pixels' centres, their first hits, pixels at edges; eager."""
 
     def __init__(self, scene: Scene, camera: Camera):
         self.scene = scene
@@ -47,3 +47,8 @@ class CommonStages:
         rays = self.center_rays
         t, face = ray_casting.intersect(self.caster, rays.origin, rays.direction, jnp.float32(np.inf))
         return np.asarray(t), np.asarray(face)
+
+    @cached_property
+    def edge_pixels(self) -> np.ndarray:
+        """Pixels [H * W] that show more than one surface: one ray is not enough for them."""
+        return pixel_edges.edge_pixels(self.scene.mesh, self.camera, self.caster, self.center_rays, self.center_hits)

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt
+from jaxtyping import Array, Bool, Float, UInt
 
 from jaxvol import camera as pinhole
 from jaxvol import media, ray_casting, sampling
@@ -12,6 +12,7 @@ from jaxvol.types import Camera, Scene
 
 _PIXEL = sampling.stream("instant_multiple_scattering.pixel")
 STRATA = 4  # of a pixel, each way
+_RECURRENCE = np.array([0.7548777, 0.5698403], np.float32)  # powers of 1/1.3247180 (Roberts 2018, two dimensions)
 
 
 def block_rays(context: Context, camera: Camera, rows: int, columns: int, *, factor: int) -> tuple:
@@ -33,11 +34,35 @@ def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[
     return rays.origin, rays.direction, t, face, index
 
 
-def through_pixels(context: Context, camera: Camera, index: UInt[Array, "n"]) -> tuple[tuple, np.ndarray]:
+def lanes(pixels: UInt[np.ndarray, "n"], edges: Bool[np.ndarray, "HW"] | None, number: int) -> tuple:
+    """(pixel, ray of it) of all eye rays: one for each of `pixels`, then the others of the `number` where `edges` says so.
+
+    The others of one pixel follow each other. Without jitter all rays of a pixel would be one: `edges` is None then.
+    """
+    more = np.zeros(0, np.uint32) if edges is None else pixels[edges[pixels]]
+    ray = np.tile(np.arange(1, number, dtype=np.uint32), len(more))
+    pixel = np.concatenate([pixels, np.repeat(more, number - 1)])
+    return pixel, np.concatenate([np.zeros(len(pixels), np.uint32), ray])
+
+
+def mean_over_rays(values: Float[np.ndarray, "m 3"], pixels: UInt[np.ndarray, "n"], edges, number: int) -> np.ndarray:
+    """One value for each of `pixels` from those of `lanes`, [n, 3]."""
+    first, others = values[: len(pixels)], values[len(pixels) :]
+    if not len(others):
+        return first
+    mean, chosen = first.copy(), edges[pixels]
+    mean[chosen] = (first[chosen] + others.reshape(-1, number - 1, 3).sum(axis=1)) / number
+    return mean
+
+
+def through_pixels(
+    context: Context, camera: Camera, index: UInt[Array, "n"], *, ray: UInt[Array, "n"] | None = None
+) -> tuple[tuple, np.ndarray]:
     """What `gather_rays` takes for rays through pixels, and the weight [n, 1] of their values.
 
-    Without surfaces a jittered ray is one of 16 strata of the pixel, chosen in proportion to 1 - exp(-length * mean
-    extinction) inside the medium: a pixel at the medium's edge is then not hit or missed by chance.
+    `ray` numbers the rays of one pixel (None: the first of each): they are spread by an additive recurrence. Without
+    surfaces a jittered ray is one of 16 strata of the pixel, chosen in proportion to 1 - exp(-length * mean extinction)
+    inside the medium: a pixel at the medium's edge is then not hit or missed by chance.
     """
     index = jnp.asarray(index)
     xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
@@ -45,6 +70,9 @@ def through_pixels(context: Context, camera: Camera, index: UInt[Array, "n"]) ->
         return cast(context, camera, xy + 0.5, index), np.float32(1.0)
     if context.scene.mesh is not None or context.scene.medium is None:
         inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
+        if ray is not None:
+            inside = (inside + ray[:, None] * _RECURRENCE) % 1.0
+            index = index + ray * jnp.uint32(camera.height * camera.width)
         return cast(context, camera, xy + inside, index), np.float32(1.0)
     chosen, weight = choose_in_pixel(context.scene, camera, xy, index, context.seed)
     return cast(context, camera, chosen, index), np.asarray(weight)[:, None]

@@ -224,6 +224,8 @@ def in_tiles(function: Callable, *arrays: Array | None) -> Float[Array, "n 3"]:
     """function(*arrays) over tiles of the first axis that fit the cache; scalars and None go along as they are."""
     n = arrays[0].shape[0]
     tiles = max(1, n // _TILE)
+    while n % tiles and tiles < 2 * n // _TILE:
+        tiles += 1
     if tiles == 1 or n % tiles:
         return function(*arrays)
     parts = jax.tree.map(lambda x: x.reshape(tiles, n // tiles, *x.shape[1:]), arrays)

@@ -348,20 +348,23 @@ def _rows(vertices, chosen):
     return jax.tree.map(lambda x: np.asarray(x)[chosen], vertices)
 
 
-def padded(values):
-    """`values` with zeros up to a power of two times 64: few sizes, few compilations."""
+def padded(values, *, factor=2):
+    """`values` with zeros up to a power of `factor` times 64: few sizes, few compilations."""
     size = 64
     while size < len(values):
-        size *= 2
+        size *= factor
     return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
 
 
 def _compact(state, alive):
-    """The live lanes, padded with dead ones; `alive` (numpy) may be less than the state's own."""
+    """The live lanes, padded with dead ones; `alive` (numpy) may be less than the state's own.
+
+    Every size is a program that takes longer to compile than a whole walk to run: sizes fall to a quarter at a time.
+    """
     lanes = np.flatnonzero(alive)
-    chosen = padded(lanes)
+    chosen = padded(lanes, factor=4)
     live = np.arange(len(chosen)) < len(lanes)
-    if len(chosen) == len(alive):
+    if len(chosen) >= len(alive):
         chosen, live = np.arange(len(alive)), alive
     else:
         state = jax.tree.map(lambda x: np.asarray(x)[chosen], state)

@@ -23,6 +23,7 @@ from jaxvol.methods.instant_multiple_scattering.virtual_lights import VirtualLig
 from jaxvol.types import Medium
 
 _LEAST = 1e-3  # share of the mean density that the estimate assumes where the table says there is none
+_DARKEST = 1e-4  # albedo that the estimate assumes at least
 
 
 class Picks(eqx.Module):
@@ -159,7 +160,10 @@ def pick_for_points(
     num_groups: int,
     isotropic: bool,
 ) -> Picks:
-    """For each point and group one light."""
+    """For each point and group one light; black points pick as dark grey ones do, so that their slopes are right."""
+    if points.surface is not None:
+        floored = jnp.maximum(points.surface.albedo, _DARKEST)
+        points = eqx.tree_at(lambda p: p.surface.albedo, points, floored)
     sigma = 0.0 if medium is None else jnp.mean(media.sigma_t(medium)) * _mean_density(medium)
 
     def estimate(light, _):

@@ -50,6 +50,7 @@ class Plan:
     refine_below: float
     tile: int
     jitter: bool
+    edge_rays: int  # eye rays of a pixel that an edge crosses; 1 without surfaces
     caster: str
     grey: bool
     isotropic: bool
@@ -116,6 +117,7 @@ def plan(
     refine_below: float = 0.25,
     tile: int = 8192,
     jitter: bool = True,
+    edge_rays: int = 4,
     caster: str = "auto",
     specialize: str = "values",
 ) -> Plan:
@@ -142,6 +144,8 @@ def plan(
     group_size: where pairs are costly, one light of so many is marched to and tested for occlusion.
     upsample: evaluate at 1/upsample^2 of the pixels and reconstruct (biased where it interpolates); pixels whose
     neighbours weigh less than refine_below are evaluated too.
+    jitter: eye rays at random places of their pixels. edge_rays: as many of them where the pixel shows more than one surface
+    (with jitter, without upsampling).
     specialize: "structure" looks at no values (for gradients).
     Raises ValueError for a medium with a boundary, inclusions or a refractive index, and for values out of range.
     """
@@ -161,7 +165,7 @@ def plan(
         if value not in CHOICES[key]:
             raise ValueError(f"{key}: {value!r} is not allowed, must be one of {', '.join(CHOICES[key])}")
     least = {"num_paths": 1, "num_sets": 1, "max_depth": 1, "num_levels": 0, "num_chains": 1, "num_direct": 1}
-    least.update(map_size=4, map_steps=1, num_evaluations=1, group_size=1, mip_block=1, upsample=1, tile=64)
+    least.update(map_size=4, map_steps=1, num_evaluations=1, group_size=1, mip_block=1, upsample=1, tile=64, edge_rays=1)
     for key, low in least.items():
         if locals()[key] is not None and locals()[key] < low:
             raise ValueError(f"{key}: {locals()[key]} is not allowed, must be >= {low}")
@@ -212,6 +216,7 @@ def plan(
         refine_below=refine_below,
         tile=tile,
         jitter=jitter,
+        edge_rays=edge_rays if scene.mesh is not None and jitter and upsample == 1 else 1,
         caster=caster,
         grey=medium is not None and values and media.is_grey(medium),
         isotropic=medium is not None and values and media.is_isotropic(medium),
@@ -301,7 +306,7 @@ def _skipped(scene, lit, scatters, reflects, values, num_levels):
     if scene.mesh is None:
         reasons.append("no surfaces: no rays are cast, surface layers are exactly zero")
     elif not reflects:
-        reasons.append("black surfaces: they only occlude, surface layers are exactly zero")
+        reasons.append("black surfaces: they only occlude, no virtual lights on them, surface layers are exactly zero")
     if scatters and values and media.is_isotropic(scene.medium):
         reasons.append("g = 0: no phase function is evaluated")
     if scatters and values and media.is_grey(scene.medium):

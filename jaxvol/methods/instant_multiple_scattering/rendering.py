@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, UInt
+from jaxtyping import Array, Bool, Float, UInt
 
 from jaxvol import camera as pinhole
 from jaxvol import layers, materials, media, ray_casting, sampling
+from jaxvol.common_stages import CommonStages
 from jaxvol.methods.instant_multiple_scattering import (
     compensation,
     eye_rays,
@@ -208,8 +209,12 @@ def render_set(
     seed: int,
     lights: LightSet | None = None,
     sizes: dict[str, int] | None = None,
+    edges: Bool[np.ndarray, "HW"] | None = None,
 ) -> tuple[dict[str, Float[np.ndarray, "HW 3"]], dict[str, int]]:
-    """All pixels lit by one set of virtual lights: layers by name (numpy), and counts. Updates `sizes`."""
+    """All pixels lit by one set of virtual lights: layers by name (numpy), and counts. Updates `sizes`.
+
+    `edges`: pixels that get `plan.edge_rays` eye rays, the others get one.
+    """
     number = camera.height * camera.width
     result = {name: np.zeros((number, 3), np.float32) for name in NAMES}
     if not (plan.volume or plan.surface):
@@ -223,7 +228,7 @@ def render_set(
         found = virtual_lights.sizes(context.lights) if context.rays is None else ray_lights.sizes(context.rays)
         sizes.update(found)
     if plan.upsample == 1:
-        _evaluate(context, camera, np.arange(number, dtype=np.uint32), result)
+        _evaluate(context, camera, np.arange(number, dtype=np.uint32), result, edges)
         return result, counts
     return _from_low_resolution(context, camera, result, counts)
 
@@ -233,17 +238,22 @@ def _computed(plan):
     return tuple(name for name in NAMES if (plan.volume if name.startswith("volume") else plan.surface))
 
 
-def _evaluate(context, camera, index, result):
+def _evaluate(context, camera, index, result, edges=None):
     """All layers at the pixels `index`, tile by tile, into `result`."""
-    size = min(context.plan.tile, light_paths.padded(index).size)
-    for begin in range(0, len(index), size):
-        chosen = index[begin : begin + size]
-        lanes = np.full(size, chosen[-1], np.uint32)
-        lanes[: len(chosen)] = chosen
-        rays, weight = eye_rays.through_pixels(context, camera, jnp.asarray(lanes))
+    number, names = context.plan.edge_rays, _computed(context.plan)
+    pixel, ray = eye_rays.lanes(index, edges, number)
+    found = {name: np.zeros((len(pixel), 3), np.float32) for name in names}
+    size = min(context.plan.tile, virtual_lights.capacity(len(pixel)))
+    for begin in range(0, len(pixel), size):
+        count = min(size, len(pixel) - begin)
+        part = np.minimum(np.arange(begin, begin + size), len(pixel) - 1)
+        others = None if edges is None else jnp.asarray(ray[part])
+        rays, weight = eye_rays.through_pixels(context, camera, jnp.asarray(pixel[part]), ray=others)
         values = gather_rays(context, *rays)
-        for name in _computed(context.plan):
-            result[name][chosen] = (np.asarray(values[name]) * weight)[: len(chosen)]
+        for name in names:
+            found[name][begin : begin + count] = (np.asarray(values[name]) * weight)[:count]
+    for name in names:
+        result[name][index] = eye_rays.mean_over_rays(found[name], index, edges, number)
 
 
 def _from_low_resolution(context, camera, result, counts):
@@ -318,11 +328,12 @@ def render(
     *,
     seed: int = 0,
     on_progress: Callable[[float], None] | None = None,
+    common: CommonStages | None = None,
 ) -> Estimate:
     """The six layers, the mean over `plan.num_sets` independent sets of lights, and its variance when there are several.
 
-    Diagnostics: "num_truncated" light paths that were cut at max_depth, "num_lights" virtual lights of all sets; with
-    upsampling "num_evaluated" and "num_refined" pixels.
+    `common` holds what other methods have computed already. Diagnostics: "num_truncated" light paths that were cut at
+    max_depth, "num_lights" virtual lights of all sets; with upsampling "num_evaluated" and "num_refined" pixels.
     """
     counts: dict[str, int] = {}
     sizes: dict[str, int] | None = {} if plan.num_sets > 1 else None
@@ -330,8 +341,11 @@ def render(
     mean: dict[str, np.ndarray] = {}
     single = dataclasses.replace(plan, num_sets=1)  # sets share their programs with a picture of one
     squares = {name: np.float32(0.0) for name in names}  # summed squared deviations from the mean (Welford 1962)
+    edges = None
+    if names and plan.edge_rays > 1:
+        edges = (CommonStages(scene, camera) if common is None else common).edge_pixels
     for k in range(plan.num_sets):
-        images, found = render_set(scene, camera, single, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes)
+        images, found = render_set(scene, camera, single, seed=(seed * 65537 + k) & 0x7FFFFFFF, sizes=sizes, edges=edges)
         counts = {name: counts.get(name, 0) + value for name, value in found.items()}
         for name in names:
             before = mean.get(name, np.float32(0.0))

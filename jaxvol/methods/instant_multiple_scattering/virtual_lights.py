@@ -83,13 +83,23 @@ def _on_surface(mesh, vertices, num_paths, size):
     return VirtualLights(position, _pad(mirrored, size), _pad(strength, size), normal, _pad(lobe, size), _pad(exponent, size))
 
 
+def _is_black(mesh, face):
+    """Whether faces reflect nothing."""
+    dark = np.asarray(mesh.albedo)[face].max(axis=-1) == 0
+    return dark if mesh.specular is None else dark & (np.asarray(mesh.specular)[face].max(axis=-1) == 0)
+
+
 def virtual_lights(scene: Scene, vertices: Vertices, *, num_paths: int, sizes: dict[str, int] | None = None) -> LightSet:
     """Turn path vertices (numpy) into sets of lights; `num_paths` counts ALL emitted paths, also those that missed.
 
-    `sizes` are array sizes to keep where they suffice, so that the next set of lights needs no compilation.
+    Vertices on black surfaces send nothing and are left out. `sizes` are array sizes to keep where they suffice, so that
+    the next set of lights needs no compilation.
     """
     first = vertices.depth == 0
     surface = vertices.face >= 0
+    sends = vertices.valid
+    if scene.mesh is not None:
+        sends = sends & ~(surface & _is_black(scene.mesh, np.maximum(vertices.face, 0)))
     chosen = {
         "volume_first": first & ~surface,
         "volume_later": ~first & ~surface,
@@ -98,7 +108,7 @@ def virtual_lights(scene: Scene, vertices: Vertices, *, num_paths: int, sizes: d
     }
     found = {}
     for name, rows in chosen.items():
-        part = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows & vertices.valid], vertices)
+        part = jax.tree.map(lambda x, rows=rows: np.asarray(x)[rows & sends], vertices)
         count, size = len(part.path), (sizes or {}).get(name, 0)
         if count > size:
             size = capacity(count) if sizes is None else capacity(count + count // 8)

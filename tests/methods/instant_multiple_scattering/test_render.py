@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from jaxvol import camera as pinhole
-from jaxvol import layers, media
+from jaxvol import layers, media, ray_casting
+from jaxvol.common_stages import CommonStages
 from jaxvol.methods import instant_multiple_scattering as ims
-from jaxvol.methods.instant_multiple_scattering import eye_rays, rendering, upsampling
+from jaxvol.methods.instant_multiple_scattering import eye_rays, rendering, stages, upsampling
 from jaxvol.methods.instant_multiple_scattering.upsampling import Guides
+from jaxvol.methods.instant_multiple_scattering.virtual_lights import LightSet
 from jaxvol.types import Mesh, PointLights, Scene
 from tests.methods.instant_multiple_scattering.scenes import (
     EXACT,
@@ -165,3 +167,49 @@ def test_jittered_pixels_weigh_what_lies_behind_them():
         grid = (jnp.stack(jnp.meshgrid(jnp.arange(64), jnp.arange(64)), -1).reshape(-1, 2) + 0.5) / 64
         exact = float(jnp.mean(source(floats(corner) + grid)))
         assert float(jnp.mean(weight * source(places))) == pytest.approx(exact, rel=5e-3)
+
+
+def lamp_behind_a_board():
+    """A bright wall behind a dark board that covers the lower half of the picture, its edge inside a row of pixels."""
+    vertices = floats([-9, -9, -2], [9, -9, -2], [9, 9, -2], [-9, 9, -2], [-9, -9, 0], [9, -9, 0], [9, 0.04, 0], [-9, 0.04, 0])
+    mesh = Mesh(
+        vertices=vertices,
+        faces=jnp.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], jnp.int32),
+        albedo=jnp.asarray([[0.5] * 3] * 4),
+    )
+    return lit(make_medium(), mesh=mesh, position=(0.0, 2.0, 0.5))
+
+
+def test_edges_are_found_where_a_pixel_shows_two_surfaces():
+    """The row that the board's edge crosses, not the seams between triangles of one plane; none without surfaces."""
+    scene, camera = lamp_behind_a_board(), make_camera(8)
+    edges = CommonStages(scene, camera).edge_pixels.reshape(8, 8)
+    assert edges[3].all() and np.count_nonzero(edges) == 8
+    assert not CommonStages(dataclasses.replace(scene, mesh=None), camera).edge_pixels.any()
+    painted = dataclasses.replace(scene.mesh, albedo=scene.mesh.albedo.at[0].set(0.1))  # one triangle of the wall
+    assert np.count_nonzero(CommonStages(dataclasses.replace(scene, mesh=painted), camera).edge_pixels) > 8
+
+
+def test_rays_at_edges_are_averaged_over_their_pixel():
+    """Other pixels keep their one ray; a coverage of 0 or 1 becomes its mean over the pixel, without bias."""
+    scene, camera = lamp_behind_a_board(), make_camera(8)
+    pixels, number = np.arange(64, dtype=np.uint32), 64
+    edges = CommonStages(scene, camera).edge_pixels
+    pixel, ray = eye_rays.lanes(pixels, edges, number)
+    assert len(pixel) == 64 + 8 * 63 and np.bincount(pixel)[edges].tolist() == [number] * 8
+    plan = ims.plan(scene, camera, edge_rays=number)
+    context = stages.Context(scene, ray_casting.caster_for(scene.mesh), LightSet(), None, plan, 1, scene.medium)
+    (_, _, t, _, index), weight = eye_rays.through_pixels(context, camera, pixel, ray=ray)
+    assert len(np.unique(np.asarray(index))) == len(pixel) and weight == 1.0
+    covered = np.repeat((np.asarray(t) < 4.5)[:, None], 3, axis=1).astype(np.float32)  # the board, not the wall
+    mean = eye_rays.mean_over_rays(covered, pixels, edges, number)[:, 0].reshape(8, 8)
+    share = 0.5 * 8 * 0.04 / (4.0 * np.tan(0.3))  # of the row above the middle
+    np.testing.assert_allclose(mean[3], share, atol=0.02)
+    assert np.all(mean[:3] == 0) and np.all(mean[4:] == 1)
+
+
+def test_rays_at_edges_need_surfaces_jitter_and_every_pixel():
+    scene, camera = lamp_behind_a_board(), make_camera(8)
+    assert ims.plan(scene, camera).edge_rays == 4
+    assert [ims.plan(scene, camera, **off).edge_rays for off in ({"jitter": False}, {"upsample": 2})] == [1, 1]
+    assert ims.plan(lit(make_medium()), camera).edge_rays == 1
