@@ -5,6 +5,7 @@ import math
 import os
 from functools import partial
 
+import jax
 import numpy as np
 import pytest
 
@@ -186,6 +187,14 @@ def test_measured_counts_warm_calls_only():
     assert calls[4:] == [1] and cost.first_seconds == 7.0
     with pytest.raises(ValueError, match="no"):
         measure.measured(calls.append, repeats=1, first=measure.First(0.0, ValueError("no")))
+    shapes = []  # a call that compiles, as its arrays have another size, is made again
+
+    def grows(k):
+        shapes.append(k)
+        return jax.block_until_ready(jax.jit(lambda x: x + 1)(np.ones(k + 1))) if len(shapes) == 2 else None
+
+    measure.measured(grows, repeats=2)
+    assert shapes == [0, 1, 1, 2]
     measure.reset_peak()
     before = measure.peak_mib()
     block = np.ones(16 << 20)  # 128 MiB
@@ -194,9 +203,10 @@ def test_measured_counts_warm_calls_only():
 
 def test_workers_share_calls_and_say_when_one_ends():
     with workers.Workers(2) as several:
-        found = several.spread([os.getpid] * 5)
-        pids = dict(found)
-        assert len(pids) == 2 and os.getpid() not in pids.values() and {pids[k] for k, _ in found} == set(pids.values())
+        found = several.spread([[os.getpid, os.getpid]] * 3 + [[]])
+        pids = {worker: pids[0] for worker, pids in found[:3]}
+        assert len(pids) == 2 and os.getpid() not in pids.values() and found[3] == (0, [])
+        assert all(own == [pids[worker]] * 2 for worker, own in found[:3])
         assert several.call(1, os.getpid) == pids[1]
         with pytest.raises(ValueError, match="factorial"):
             several.call(0, partial(math.factorial, -1))
@@ -205,9 +215,8 @@ def test_workers_share_calls_and_say_when_one_ends():
         assert several.call(0, os.getpid) == pids[0]
     stop = Stop()
     with workers.Workers(1) as one:
-        assert one.spread([os.getpid, partial(setattr, stop, "requested", True), os.getpid], stop) == [
-            (0, os.getpid()), (0, None), None,
-        ]  # fmt: skip
+        groups = [[os.getpid, partial(setattr, stop, "requested", True), os.getpid], [os.getpid]]
+        assert one.spread(groups, stop) == [(0, [os.getpid(), None]), (0, [])]
 
 
 def test_a_composite_takes_turns_with_its_methods_in_one_worker():

@@ -77,21 +77,19 @@ def _first_calls(
     for task in tasks:
         groups.setdefault(teams[task.method], []).append(task)
     order = sorted(groups.values(), key=lambda group: -took.get(group[-1].method, np.inf))
+    made = workers.spread([[partial(_compile, task.compile) for task in group] for group in order], stop)
     found = {}
-    results = workers.spread([partial(_compile, tuple(task.compile for task in group)) for group in order], stop)
-    for group, result in zip(order, results, strict=True):
-        if result is not None:
-            worker, firsts = result
-            took[group[-1].method] = sum(first.seconds for first in firsts)
-            found |= {task.key: (worker, first) for task, first in zip(group, firsts, strict=True)}
+    for group, (worker, firsts) in zip(order, made, strict=True):
+        took[group[-1].method] = sum(first.seconds for first in firsts)
+        found |= {task.key: (worker, first) for task, first in zip(group, firsts, strict=False)}  # fewer after `stop`
     return found
 
 
-def _compile(calls: tuple[Callable[[], First], ...]) -> list[First]:
-    """First calls, one after the other. Garbage is collected later: tracing makes little, walking what it keeps takes long."""
+def _compile(call: Callable[[], First]) -> First:
+    """A first call. Garbage is collected later: tracing makes little, walking what it keeps takes long."""
     gc.disable()
     try:
-        return [call() for call in calls]
+        return call()
     finally:
         gc.enable()
 

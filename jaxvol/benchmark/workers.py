@@ -55,20 +55,29 @@ class Workers:
         for worker in range(max(len(self._lines), 1)):
             self.call(worker, call)
 
-    def spread(self, calls: Sequence[Call], stop: Stop | None = None) -> list[tuple[int, Any] | None]:
-        """(worker, result) of each call; the next one goes to whoever is idle. None for those not begun before `stop`."""
+    def spread(self, groups: Sequence[Sequence[Call]], stop: Stop | None = None) -> list[tuple[int, list[Any]]]:
+        """(worker, results) of each group, one call after the other; the next group goes to whoever is idle.
+
+        None is begun after `stop`: results may be fewer than calls.
+        """
         if not self._lines:
-            return [None if stop else (0, call()) for call in calls]
-        found: list[tuple[int, Any] | None] = [None] * len(calls)
-        waiting, busy = list(range(len(calls))), {}
+            return [(0, [call() for call in group if not stop]) for group in groups]
+        found: list[tuple[int, list[Any]]] = [(0, []) for _ in groups]
+        waiting, busy = [k for k, group in enumerate(groups) if group], {}
         while busy or (waiting and not stop):
             for worker in range(len(self._lines)):
                 if worker not in busy and waiting and not stop:
                     busy[worker] = waiting.pop(0)
-                    self._send(worker, calls[busy[worker]])
+                    found[busy[worker]] = (worker, [])
+                    self._send(worker, groups[busy[worker]][0])
             ready = wait([self._lines[worker] for worker in busy])
             for worker in [worker for worker in busy if self._lines[worker] in ready]:
-                found[busy.pop(worker)] = (worker, self._receive(worker))
+                calls, results = groups[busy[worker]], found[busy[worker]][1]
+                results.append(self._receive(worker))
+                if len(results) < len(calls) and not stop:
+                    self._send(worker, calls[len(results)])
+                else:
+                    del busy[worker]
         return found
 
     def _send(self, worker: int, call: Call) -> None:
