@@ -32,7 +32,7 @@ def edge_pixels(
     Features smaller than a pixel that miss its centre and its corners are not found. All False without surfaces.
     """
     height, width = camera.height, camera.width
-    if mesh is None:
+    if caster is None:
         return np.zeros(height * width, bool)
     x, y = np.meshgrid(np.arange(width + 1, dtype=np.float32), np.arange(height + 1, dtype=np.float32))
     rays = cameras.generate_rays(camera, jnp.asarray(np.stack([x, y], axis=-1).reshape(-1, 2)))
