@@ -1,5 +1,6 @@
 """Pinhole camera: pixels to rays and back. Row 0 is the top; x goes right = cross(forward, up)."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -16,6 +17,7 @@ def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Float[Array,
     return jnp.concatenate([rotation, jnp.asarray([[0.0, 0.0, 0.0, 1.0]], jnp.float32)], axis=0)
 
 
+@jax.jit
 def pixel_centers(camera: Camera) -> Float[Array, "HW 2"]:
     """(x, y) of every pixel centre, row by row from the top: the first is (0.5, 0.5)."""
     x = jnp.arange(camera.width, dtype=jnp.float32) + 0.5
@@ -23,6 +25,7 @@ def pixel_centers(camera: Camera) -> Float[Array, "HW 2"]:
     return jnp.stack(jnp.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
 
 
+@jax.jit
 def generate_rays(camera: Camera, pixel_xy: Float[Array, "*batch 2"]) -> Rays:
     """Unbounded rays through positions given in pixels."""
     half_height = jnp.tan(0.5 * camera.fov_y)

@@ -76,12 +76,15 @@ def _first_calls(
     groups: dict[str, list[Task]] = {}
     for task in tasks:
         groups.setdefault(teams[task.method], []).append(task)
-    order = sorted(groups.values(), key=lambda group: -took.get(group[-1].method, np.inf))
+    expected = {name: sum(took.get(method, np.inf) for method in {task.method for task in g}) for name, g in groups.items()}
+    order = [groups[name] for name in sorted(groups, key=lambda name: -expected[name])]
     made = workers.spread([[partial(_compile, task.compile) for task in group] for group in order], stop)
-    found = {}
+    found, spent = {}, {}
     for group, (worker, firsts) in zip(order, made, strict=True):
-        took[group[-1].method] = sum(first.seconds for first in firsts)
-        found |= {task.key: (worker, first) for task, first in zip(group, firsts, strict=False)}  # fewer after `stop`
+        for task, first in zip(group, firsts, strict=False):  # fewer after `stop`
+            found[task.key] = worker, first
+            spent[task.method] = spent.get(task.method, 0.0) + first.seconds
+    took.update(spent)
     return found
 
 
