@@ -6,6 +6,7 @@ from the unrolled iteration. The number of applications of B does not depend on 
 (stepping.py) needs as many steps as light needs to cross the grid, times the scattering orders.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -41,7 +42,29 @@ def solve(
     """Solve for the scattered light that `deposit` (W scattered per voxel out of the marched light, isotropic) makes.
 
     `levels` from `preconditioner.build`; None = plain conjugate gradients. `tolerance` is of the residual of u, relative.
+
+    Where k is 0 sqrt(k) has no slope, and u is 0 whatever phi is: for slopes dk sends out phi dk there, as a deposit would.
     """
+
+    def plain(coefficients, deposit, tolerance, levels):
+        return _solve(lattice, coefficients, deposit, tolerance, max_steps, levels)
+
+    @jax.custom_jvp
+    def solved(coefficients, deposit, tolerance, levels):
+        return plain(coefficients, deposit, tolerance, levels)
+
+    @solved.defjvp
+    def slopes(primals, tangents):
+        k, dk = primals[0].scattering, tangents[0].scattering
+        sent = jnp.where(k > 0, 0.0, dk * solved(*primals).phi)
+        solving = partial(plain, tolerance=primals[2], levels=primals[3])
+        value, slope = jax.jvp(solving, primals[:2], (tangents[0], tangents[1] + sent))
+        return value, slope._replace(phi_first=slope.phi_first - transport(lattice, primals[0], sent))
+
+    return solved(coefficients, deposit, tolerance, levels)
+
+
+def _solve(lattice, coefficients, deposit, tolerance, max_steps, levels):
     root = _safe_sqrt(coefficients.scattering)
     phi_first = transport(lattice, coefficients, deposit)
     right = root * phi_first

@@ -202,6 +202,28 @@ def test_gradient_of_the_solve_against_finite_differences(medium):
     assert float(gradient) == pytest.approx(float((high - low) / (2 * step)), rel=1e-2)
 
 
+def test_slopes_by_the_scattering_of_empty_voxels():
+    """sqrt(k) has none at 0: light that a little of the medium would scatter in a void, once and again."""
+    rng = np.random.default_rng(5)
+    void = jnp.zeros((4, 4, 4)).at[1:3, 1:3, 1:3].set(1.0)
+    filled, deposit = (jnp.asarray(x, jnp.float32) for x in rng.random((2, 4, 4, 4)))
+
+    @jax.jit
+    def light(amount):
+        def parts(amount):
+            co = coefficients(LATTICES["paper"], jnp.where(void > 0, amount, 0.7 * filled), jnp.full((4, 4, 4), 0.05))
+            found = solve(LATTICES["paper"], co, deposit * (void == 0), tolerance=1e-6)
+            return jnp.stack([jnp.sum(found.phi_first), jnp.sum(found.phi)])
+
+        return jax.jvp(parts, (amount,), (jnp.float32(1.0),))
+
+    _, slope = light(jnp.float32(0.0))
+    (high, _), (low, _) = light(jnp.float32(0.02)), light(jnp.float32(0.01))
+    (dark, _) = light(jnp.float32(0.0))
+    expected = (4.0 * low - high - 3.0 * dark) / 0.02  # one-sided, second order
+    np.testing.assert_allclose(slope, expected, rtol=2e-2)
+
+
 def test_two_albedos_compile_once():
     lat = LATTICES["paper"]
     traces = []
