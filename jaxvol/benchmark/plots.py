@@ -7,6 +7,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+from matplotlib import ticker  # noqa: E402
 
 from jaxvol import image, jobs  # noqa: E402
 from jaxvol.benchmark import report  # noqa: E402
@@ -62,6 +63,12 @@ def _panel(axis, records, out, scene, names, truth):
     axis.set_ylabel("relMSE", fontsize=8)
     axis.grid(True, which="both", alpha=0.2)
     axis.legend(fontsize=6)
+    for one, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
+        steps = (1.0, 2.0, 5.0) if high < 100 * low else (1.0,)  # labels of all nine would lie upon each other
+        one.set_major_locator(ticker.LogLocator(subs=steps))
+        one.set_major_formatter(ticker.FormatStrFormatter("%g"))
+        one.set_minor_formatter(ticker.NullFormatter())
+    axis.tick_params(labelsize=7)
 
 
 def scaling(rows: list[Record], out: Path) -> Path:
