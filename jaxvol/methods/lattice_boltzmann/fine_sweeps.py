@@ -10,6 +10,11 @@ interpolation spreads light sideways by f (1 - f) voxels^2 a step, which is 8 % 
 0.5 (measured: a point source in a cube 4.1 % off with it, 1.4 % without). The parabolas are those of Lax and Wendroff in
 flux form: what is not conserved at the faces shows as reflectance (+4 % at thickness 8).
 
+Intensities move sideways between planes; with the exponential map, which is that of thick voxels, in the middle of each
+step. Then as much light leaves an opaque voxel through its sides as marched light enters there: under an even sky, where
+all is 1, a cube of 6^3 voxels of 50 mean free paths each is 22 % too bright in its corners otherwise and 7 % on average
+(now 1.0 and .5 %).
+
 The correction (illumination.py) removes the lattice's angular error: phi <- phi + (I - B26 k)^-1 (B80 (k phi + b) - phi),
 two of them, each a lattice solve, also for moments of anisotropic light (`moments`).
 """
@@ -78,9 +83,13 @@ def _scan(extinction, sources, mine, along, degree, kind, *, sense):
     lengths = sorted({length for length, *_ in steps})
     varying = jnp.ndim(extinction) > 0
 
+    halves = kind == "exp"
+
     def links(sigma):
-        """(what of an arrival counts, of the own source, what passes, of the source) by the length of a step."""
+        """(what of an arrival counts, of the own source, what passes, of the source) by the length of a step or of its half."""
         maps = {length: beta_gamma(length * sigma, kind) for length in lengths}
+        if halves:
+            return {k: _half(k, jnp.exp(-0.5 * k * sigma), *found) for k, found in maps.items()}
         return {k: (beta, k * gamma, 1.0 - k * sigma * beta, k * beta) for k, (beta, gamma) in maps.items()}
 
     same = None if varying else links(extinction)
@@ -88,12 +97,18 @@ def _scan(extinction, sources, mine, along, degree, kind, *, sense):
     def body(faces, planes):
         sigma, source = planes if varying else (extinction, planes)
         voxel = links(sigma) if varying else same
+        across = tuple(_alike(sigma, axis) for axis in (0, 1)) if varying and halves else (1.0, 1.0)
         gathered, leaving = [0.0] * source.shape[0], []
         for face, (length, weight, row_shift, column_shift, values) in zip(faces, steps, strict=True):
             beta, own, through, out = voxel[length]
             emitted = sum(v * source[n] for n, v in enumerate(values))
-            face = _shift(_shift(face, 0, sense * row_shift), 1, sense * column_shift)
-            mean = weight * (beta * face + own * emitted)
+            entering = face
+            if halves:
+                face = through * face + out * emitted
+            face = _shift(face, 0, sense * row_shift, across[0])
+            face = _shift(face, 1, sense * column_shift, across[1])
+            counted = 0.5 * (entering + face) if halves else face
+            mean = weight * (beta * counted + own * emitted)
             gathered = [total + v * mean for total, v in zip(gathered, values, strict=True)]
             leaving.append(through * face + out * emitted)
         return tuple(leaving), jnp.stack(gathered)
@@ -102,12 +117,27 @@ def _scan(extinction, sources, mine, along, degree, kind, *, sense):
     return lax.scan(body, start, (extinction, sources) if varying else sources, reverse=sense < 0)[1]
 
 
-def _shift(plane, axis, amount):
+def _half(length, passing, beta, gamma):
+    """The same four numbers of half a step, two of which make the step of `beta_gamma`."""
+    share = beta / (1.0 + passing)
+    return 2.0 * share, length * (gamma - share * share), passing, length * share
+
+
+def _alike(sigma, axis):
+    """1 between columns of like transmittance, down to 0 between clear and opaque ones; 1 at the outer faces."""
+    passing = jnp.exp(-sigma)
+    low, high = (lax.slice_in_dim(passing, k, sigma.shape[axis] + k - 1, axis=axis) for k in (0, 1))
+    widths = [(1, 1) if a == axis else (0, 0) for a in range(2)]
+    return jnp.pad(1.0 - jnp.abs(high - low), widths, constant_values=1.0)
+
+
+def _shift(plane, axis, amount, alike=1.0):
     """The plane moved by a fraction t of a column, at most 1: parabola through a column, its source and its successor.
 
     In flux form, a column passes t (p + (1 - t)/2 (its successor - p)) on (Lax and Wendroff 1960), so that nothing is
     lost inside. Nothing comes in at the first column. Beyond the last one the plane goes on linearly: held constant, too
-    much of it leaves where it falls towards the face (1.5 % of the fluence there, at sigma_t h = 0.5).
+    much of it leaves where it falls towards the face (1.5 % of the fluence there, at sigma_t h = 0.5). The slope counts as
+    much as columns are `alike`: light leaves an opaque column for a clear one as bright as it is.
     """
     t, size = abs(amount), plane.shape[axis]
     if t < 1e-6:
@@ -118,6 +148,7 @@ def _shift(plane, axis, amount):
     before = -(1.0 - t) / (1.0 + t) * inflow  # then its inflow is zero
     beyond = 2.0 * outflow - lax.slice_in_dim(plane, inner, inner + 1, axis=axis)
     padded = jnp.concatenate([before, plane, beyond] if amount > 0 else [beyond, plane, before], axis=axis)
-    source, successor = (0, 2) if amount > 0 else (2, 0)
-    shares = ((source, 0.5 * t * (t + 1.0)), (1, 1.0 - t * t), (successor, 0.5 * t * (t - 1.0)))
-    return sum(share * lax.slice_in_dim(padded, first, first + size, axis=axis) for first, share in shares)
+    left, right = (lax.slice_in_dim(padded, k, k + size + 1, axis=axis) for k in (0, 1))
+    source, successor = (left, right) if amount > 0 else (right, left)
+    flow = amount * (source + 0.5 * (1.0 - t) * alike * (successor - source))
+    return plane + lax.slice_in_dim(flow, 0, size, axis=axis) - lax.slice_in_dim(flow, 1, size + 1, axis=axis)

@@ -157,15 +157,19 @@ def _directional(materials, channel, whole, flow, plan):
         found = solve_directional(scattering, absorption, g, sources, plan.tolerance, plan=plan)
     else:
         strength = _strength(scattering, g, plan.degree)
-        moments, applications = jnp.zeros_like(sources), jnp.zeros((), jnp.int32)
-        for turn in range(1 + plan.corrections):
+
+        def arrive(moments):
             emitted = strength * moments + sources
-            arriving = fine_moments(scattering + absorption, emitted, degree=plan.degree, kind=plan.probability_map)
-            defect = arriving - moments
-            share, tolerance = _wanted(defect, arriving, turn, plan)
+            return fine_moments(scattering + absorption, emitted, degree=plan.degree, kind=plan.probability_map)
+
+        def answer(defect, tolerance):
             found = solve_directional(scattering, absorption, g, strength * defect, tolerance, plan=plan)
-            moments, applications = moments + defect + found.moments, applications + found.num_applications
-        found = found._replace(moments=moments, num_applications=applications, residual=share * found.residual)
+            return found.moments, found
+
+        moments, applications, residual, converged = _corrected(
+            arrive(jnp.zeros_like(sources)), arrive, answer, scattering, plan
+        )
+        found = anisotropy.Moments(moments, applications, residual, converged)
     scale = anisotropy.eigenvalues(g, plan.degree)[1]
     flux = 3.0**0.5 * scale * found.moments[1:4]  # the moments carry sqrt(3)
     return jnp.maximum(found.moments[0], 0.0), flux, found.num_applications, found.residual, found.converged
@@ -177,8 +181,35 @@ def _strength(scattering, g, degree):
     return jnp.stack([scattering * scale[l] for l in anisotropy.orders(degree)])
 
 
-def _wanted(defect, arriving, turn, plan):
-    """(share of the defect in the light, relative residual that its solve should reach)."""
+def _corrected(defect, arrive, answer, scattering, plan):
+    """(light, applications, residual, converged) of light = arrive(light); the lattice answers defects, the first is arrive(0).
+
+    `arrive` is transport along many directions. The lattice lets less light pass between thick voxels and answers too
+    much: each answer is taken as many times as leaves the smallest defect of what is scattered, the last as often as that
+    before it.
+    """
+    light, applications, share = jnp.zeros_like(defect), jnp.zeros((), jnp.int32), 1.0
+    for turn in range(1 + plan.corrections):
+        if turn:
+            before, defect = defect, arrive(light) - light
+            image = before - defect  # what one `step` takes off
+            share = _ratio(jnp.sum(scattering * before * image), jnp.sum(scattering * image * image))
+            light, defect = light + (share - 1.0) * step, before - share * image
+        relative, tolerance = _wanted(defect, light, turn, plan)
+        found, solution = answer(defect, tolerance)
+        step = defect + found
+        light = light + (share if turn == plan.corrections else 1.0) * step
+        applications = applications + solution.num_applications
+    return light, applications, relative * solution.residual, solution.converged
+
+
+def _ratio(a, b):
+    return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 1.0)
+
+
+def _wanted(defect, light, turn, plan):
+    """(share of the defect in the light that arrives, relative residual that its solve should reach)."""
+    arriving = light + defect
     # an error of the correction weighs as much less as the defect is smaller than the light itself
     share = jnp.sqrt(jnp.sum(defect * defect) / jnp.maximum(jnp.sum(arriving * arriving), 1e-30))
     tolerance = jnp.minimum(plan.tolerance / jnp.maximum(share, 1e-6), 0.1)
@@ -286,18 +317,16 @@ def _channel(scattering, absorption, deposit, first, wall, reflectance, plan):
         )
         return from_volume, answer.phi, answer.num_applications, answer.residual, answer.converged
     extinction = scattering + absorption
-    phi = jnp.zeros_like(deposit)
-    applications, residual, converged = jnp.zeros((), jnp.int32), jnp.zeros(()), jnp.asarray(True)
-    once = None
-    for turn in range(1 + plan.corrections):
-        arriving = fine_transport(extinction, scattering * phi + deposit, kind=plan.probability_map)
-        once = arriving if once is None else once
-        defect = arriving - phi
-        share, tolerance = _wanted(defect, arriving, turn, plan)
-        answer = solve_channel(scattering, absorption, scattering * defect, None, 0.0, tolerance, plan=plan)
-        phi = phi + defect + answer.phi
-        applications = applications + answer.num_applications
-        residual, converged = share * answer.residual, answer.converged
+
+    def arrive(phi):
+        return fine_transport(extinction, scattering * phi + deposit, kind=plan.probability_map)
+
+    def answer(defect, tolerance):
+        found = solve_channel(scattering, absorption, scattering * defect, None, 0.0, tolerance, plan=plan)
+        return found.phi, found
+
+    once = arrive(jnp.zeros_like(deposit))
+    phi, applications, residual, converged = _corrected(once, arrive, answer, scattering, plan)
     from_volume = fine_transport(extinction, first, kind=plan.probability_map) if plan.num_surface_rays else once
     return from_volume, phi, applications, residual, converged
 

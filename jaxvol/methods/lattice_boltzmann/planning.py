@@ -179,7 +179,7 @@ def plan(
             f"warning: sigma_t' h = {thickest:.2g} is coarse for the lattice; resolution = {enough} brings it to {_THICK:g}"
         )
     if probability_map == "auto":
-        probability_map = "exp" if thickest > 2.0 else "pade"
+        probability_map = "exp" if thickest > _THICK else "pade"
     if integrator == "auto":
         # an index given on a grid, without a boundary, varies smoothly; steps at surfaces want the projection
         smooth = all(p.ior is None or np.ndim(p.ior) == 3 for p in regions(scene.medium)) and scene.medium.boundary is None

@@ -109,10 +109,23 @@ def _truncated(g, cosine, straightness, degree):
 
 
 def _spread(part, cosine, straightness):
-    """4 pi p of light whose directions have a mean of length `straightness`: sharpened less by that, exact at 1."""
+    """4 pi p of light whose directions have a mean of length `straightness` s: flattened by that, exact at 1.
+
+    Light of one radiance in a cone of that mean fills 1 - s of the sphere. Whatever scatters it, nowhere is it seen brighter
+    than in that cone: 4 pi p <= 1 / (1 - s). So a sky does not glare where scattering is peaked.
+    """
     if part.phase is None:
-        return 4.0 * math.pi * phase.henyey_greenstein(cosine, part.g * straightness)
-    return 1.0 + straightness * (4.0 * math.pi * phase.evaluate(part, cosine) - 1.0)
+        return 4.0 * math.pi * phase.henyey_greenstein(cosine, spread_g(part.g, straightness))
+    peak = 4.0 * math.pi * jnp.max(part.phase.value) - 1.0
+    share = jnp.minimum(straightness, straightness / jnp.maximum((1.0 - straightness) * peak, 1e-6))
+    return 1.0 + share * (4.0 * math.pi * phase.evaluate(part, cosine) - 1.0)
+
+
+def spread_g(g, straightness):
+    """g of what scatters light whose directions have a mean of that length: g times it, less where the peak is too high."""
+    wide = jnp.maximum(1.0 - straightness, 1e-6)
+    most = 0.5 * (2.0 + wide - jnp.sqrt(wide * (wide + 8.0)))  # (1 + g) / (1 - g)^2 = 1 / wide
+    return jnp.clip(g * straightness, -most, most)
 
 
 def gather_straight(
@@ -297,7 +310,7 @@ def _bent(table, shape, layout, degree, step, integrator, solid, position, headi
         emitted = scattered[:, None, :] * fluence
         if first is not None:
             g = row[:, columns - 1 : columns]
-            exact = 4.0 * math.pi * phase.henyey_greenstein(first[2], g * first[3]) / (1.0 - forward_part(g, degree))
+            exact = 4.0 * math.pi * phase.henyey_greenstein(first[2], spread_g(g, first[3])) / (1.0 - forward_part(g, degree))
             hard = _truncated(g, *first[2:], degree)
             emitted = emitted + scattered[:, None, :] * _once(first, exact[..., None], hard[..., None])
         seen = through * mean_through(thickness) / (4.0 * math.pi * (n * n)[:, None])

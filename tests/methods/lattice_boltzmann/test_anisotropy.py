@@ -1,5 +1,7 @@
 """Scattering that depends on direction: the Theta of moments, its solve, and the exact first order in the picture."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -7,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxvol import camera as cameras
-from jaxvol import direct
+from jaxvol import direct, phase
 from jaxvol.methods import lattice_boltzmann
-from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, illumination, materials, preconditioner
+from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, illumination, materials, preconditioner, view
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import LATTICES, coefficients
 from jaxvol.methods.lattice_boltzmann.solver import solve
@@ -134,6 +136,26 @@ def test_corrections_along_many_directions_agree_where_nothing_is_left_to_correc
     alone = fine_sweeps.transport(sigma, source)
     with_moments = fine_sweeps.moments(sigma, sources.at[3].set(0.0), degree=1)
     np.testing.assert_allclose(with_moments[0], alone, rtol=1e-4)
+
+
+@pytest.mark.parametrize("g", [-0.99, 0.6])
+def test_light_from_half_the_sky_is_scattered_no_brighter_than_the_sky(g):
+    """4 pi p of spread light: the exact one for a beam, normalised, and below 1 / (1 - s); along the axis of half a sky 2 F."""
+    medium = Medium(jnp.asarray([[0.0] * 3, [1.0] * 3]), jnp.ones(3), jnp.zeros(3), jnp.float32(g))
+    parts = [medium]
+    if g > 0:
+        parts.append(replace(medium, g=jnp.float32(0), phase=phase.phase_table(phase.moments(medium, 64))))
+    cosine = jnp.linspace(-1.0, 1.0, 2001)
+    for part in parts:
+        np.testing.assert_allclose(view._spread(part, cosine, 1.0), 4 * np.pi * phase.evaluate(part, cosine), rtol=0.02)
+        for straightness in (0.95, 0.5, 0.0):
+            found = np.asarray(view._spread(part, cosine, straightness))
+            assert 0.5 * np.trapezoid(found, cosine) == pytest.approx(1, abs=0.01)
+            assert found.max() < 1.001 / (1 - straightness)
+    # the share F of scattered light that stays in the half sky, or goes back into it
+    size = abs(g)
+    share = (1 - g * g) / (2 * size) * (1 / (1 - size) - 1 / np.sqrt(1 + g * g))
+    assert float(view._spread(medium, jnp.sign(jnp.float32(g)), 0.5)) == pytest.approx(2 * share, rel=0.15)
 
 
 def test_plan_refuses_what_directions_cannot_do():

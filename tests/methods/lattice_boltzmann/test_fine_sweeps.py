@@ -1,10 +1,16 @@
 """Transport along 80 directions: its quadrature, against integration, power."""
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxvol.methods.lattice_boltzmann import fine_sweeps
+
+SIDE = 12
+FINE = {kind: jax.jit(partial(fine_sweeps.transport, kind=kind)) for kind in ("pade", "exp")}
 
 
 def test_quadrature_of_the_fine_sweeps():
@@ -20,8 +26,8 @@ def test_quadrature_of_the_fine_sweeps():
 
 def test_fine_sweeps_against_straight_integration():
     """Fluence in the middle of a uniform source with absorption, against the integral over directions in float64."""
-    n, x = 12, 0.3
-    phi = fine_sweeps.transport(jnp.full((n,) * 3, x), jnp.ones((n,) * 3))
+    n, x = SIDE, 0.3
+    phi = FINE["pade"](jnp.full((n,) * 3, x, jnp.float32), jnp.ones((n,) * 3))
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(20000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -33,8 +39,17 @@ def test_fine_sweeps_against_straight_integration():
 
 def test_fine_sweeps_keep_all_power():
     """From the middle of a thick cube next to nothing escapes: all of the source is met by extinction."""
-    n, x = 24, 1.0
-    source = jnp.zeros((n,) * 3).at[12, 11, 12].set(1.0)
-    for kind in ("pade", "exp"):
-        phi = fine_sweeps.transport(jnp.full((n,) * 3, x), source, kind=kind)
+    x = 2.0
+    source = jnp.zeros((SIDE,) * 3).at[6, 5, 6].set(1.0)
+    for transport in FINE.values():
+        phi = transport(jnp.full((SIDE,) * 3, x, jnp.float32), source)
         assert float(jnp.sum(x * phi)) == pytest.approx(1.0, abs=2e-4)
+
+
+@pytest.mark.parametrize("around", [0, 2])
+def test_opaque_voxels_send_light_through_all_of_their_faces(around):
+    """A cube that emits like a black body: a quarter of its faces' area times its fluence, also into clear voxels around it."""
+    n, k = SIDE - 2 * around, 60.0
+    inside = np.pad(np.ones((n,) * 3, np.float32), around)
+    phi = np.asarray(FINE["exp"](jnp.asarray(k * inside), jnp.asarray(inside)), np.float64)
+    assert n**3 - np.sum(k * inside * phi) == pytest.approx(6 * n * n / 4 / k, rel=0.02)
