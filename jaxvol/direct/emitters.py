@@ -71,22 +71,23 @@ def sample(light: Emitters, points: Float[Array, "*b 3"], u1: Float[Array, "*b"]
         mine = (target >= below) & (weight > 0)
         slot, base, share = jnp.where(mine, i, slot), jnp.where(mine, below, base), jnp.where(mine, weight, share)
         below = below + weight
-    rest = jnp.clip((target - base) / jnp.maximum(share, 1e-30), 1e-6, 1.0 - 1e-6)
+    rest = jnp.clip((target - base) / jnp.where(share > 0, share, 1.0), 1e-6, 1.0 - 1e-6)
     corners, normal, area = light.corners[slot], light.normal[slot], light.area[slot]
     radiance = light.radiance[slot]
     power = jnp.maximum(lights.luminance(radiance), 1e-30)
     angle = share / power
-    direction = jnp.where(
-        (angle > _SMALL)[..., None], _arvo(corners, points, angle, rest, u2), _by_area(corners, points, rest, u2)
-    )
+    wide = angle > _SMALL
+    # Arvo's slopes are not finite in triangles of no angle; three axes stand for them.
+    to_corners = jnp.where(wide[..., None, None], corners - points[..., None, :], jnp.eye(3))
+    by_angle = _arvo(to_corners, jnp.where(wide, angle, 0.5 * jnp.pi), rest, u2)
+    direction = jnp.where(wide[..., None], by_angle, _by_area(corners, points, rest, u2))
     cosine = -dot(direction, normal)
     height = -dot(normal, corners[..., 0, :] - points)
     lit = (total > 0) & (cosine > 1e-7) & (height > 0)
     distance = height / jnp.where(lit, cosine, 1.0)
-    density = jnp.where(
-        angle > _SMALL, 1.0 / jnp.maximum(angle, 1e-30), distance * distance / jnp.maximum(area * cosine, 1e-30)
-    )
-    pdf = jnp.where(lit, share / jnp.maximum(total, 1e-30) * density, 0.0)
+    flat = distance * distance / jnp.where(lit & ~wide, area * cosine, 1.0)
+    density = jnp.where(wide, 1.0 / jnp.where(wide, angle, 1.0), flat)
+    pdf = jnp.where(lit, share / jnp.where(lit, total, 1.0) * density, 0.0)
     distance = jnp.where(lit, distance, 1.0)
     return LightSample(
         direction=direction,
@@ -127,9 +128,9 @@ def _by_area(corners, points, u1, u2):
     return normalize(target - points)
 
 
-def _arvo(corners, points, area, u1, u2):
+def _arvo(to_corners, area, u1, u2):
     """A direction uniform in the spherical triangle of solid angle `area`."""
-    a, b, c = (normalize(corners[..., i, :] - points) for i in range(3))
+    a, b, c = (normalize(to_corners[..., i, :]) for i in range(3))
     cos_alpha, sin_alpha = _dihedral(a, b, c)
     angle = area * u1
     sine, cosine = jnp.sin(angle), jnp.cos(angle)
@@ -139,11 +140,16 @@ def _arvo(corners, points, area, u1, u2):
     numerator = (v * t - u * s) * cos_alpha - v
     denominator = (v * s + u * t) * sin_alpha
     q = jnp.clip(numerator / jnp.where(jnp.abs(denominator) > 1e-30, denominator, 1e-30), -1.0, 1.0)
-    third = q[..., None] * a + jnp.sqrt((1.0 - q) * (1.0 + q))[..., None] * _orthogonal(c, a)
+    third = q[..., None] * a + _root((1.0 - q) * (1.0 + q))[..., None] * _orthogonal(c, a)
     away = third - b
     one_minus_z = u2 * 0.5 * dot(away, away)  # 1 - z = u2 (1 - third . b)
-    sin_z = jnp.sqrt(jnp.maximum(one_minus_z * (2.0 - one_minus_z), 0.0))
+    sin_z = _root(one_minus_z * (2.0 - one_minus_z))
     return normalize((1.0 - one_minus_z)[..., None] * b + sin_z[..., None] * _orthogonal(third, b))
+
+
+def _root(x):
+    """sqrt(max(x, 0)), with slope 0 at 0."""
+    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
 
 
 def _orthogonal(x, y):

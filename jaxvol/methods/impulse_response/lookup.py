@@ -154,7 +154,9 @@ def _interpolate(grid, nodes):
 
 def angle_variable(cos_n: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """The grid's variable of the angle between a patch's normal and the way to the receiver: 1 facing, 0 edge-on, -1 behind."""
-    off = 1 - fast_math.arccos_unit(jnp.minimum(jnp.abs(cos_n), 1)) * (2 / pi)
+    size = jnp.abs(cos_n)
+    aside = size < 1  # the arccosine's slope is infinite at 1, where responses, even in the angle, are level
+    off = 1 - jnp.where(aside, fast_math.arccos_unit(jnp.where(aside, size, 0)), 0) * (2 / pi)
     far = off > 1e-6
     return jnp.where(far, jnp.sign(cos_n) * jnp.sqrt(jnp.where(far, off, 1)), 0)
 

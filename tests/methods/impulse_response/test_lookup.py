@@ -179,3 +179,12 @@ def test_reflection_of_zonal_radiance_against_the_sphere():
         lobe = (power + 1) / (2 * np.pi) * cosine**power
         truth = np.sum(weight[:, None] * light[:, None] * lobe) * np.pi / 120
         assert float(found) == pytest.approx(truth, rel=2e-3, abs=2e-3)
+
+
+def test_patches_seen_straight_on_have_slopes():
+    """Where arccos has none: facing, from behind, and edge-on."""
+    cosine = jnp.array([1.0, -1.0, 0.0, 0.5, -0.999999])
+    found, slope = jax.jvp(lookup.angle_variable, (cosine,), (jnp.ones(5),))
+    expected = np.sign(cosine) * np.sqrt(1 - np.arccos(np.abs(np.asarray(cosine, float))) * 2 / np.pi)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert np.isfinite(slope).all() and slope[3] > 0
