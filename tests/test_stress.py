@@ -132,11 +132,14 @@ def test_slopes_are_those_of_float64_and_of_differences():
     values, slopes = gradients.derivative(key, told)
     with jax.enable_x64(True):
         exact, right = gradients.derivative(key, told, kind=np.float64)
+        differences = gradients.differences(told)
     assert [x.dtype for x in (*values, *slopes, *exact, *right)] == [np.float32] * 4 + [np.float64] * 4
     for found, wanted in zip((*values, *slopes), (*exact, *right), strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
     along = right[0] * 2 * np.sqrt([1.0, 2.0]) / 3
     np.testing.assert_allclose(right[1], np.cos([1.0, 2.0]) * along)
+    for found, wanted in zip(differences, right, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-7)
 
 
 def test_a_crash_is_a_failure_and_a_refusal_is_none(monkeypatch):

@@ -11,8 +11,8 @@ from jaxvol import jobs
 from jaxvol.stress import checks, extremes, gradients, scenes
 
 RESULTS = "stress.jsonl"
-# Of each class every second scene in other units, every tenth turned, every fiftieth differentiated.
-_EVERY_UNITS, _EVERY_TURN, _EVERY_GRADIENT = 2, 10, 50
+# Of each class every second scene in other units, every tenth turned, every twenty-fifth differentiated.
+_EVERY_UNITS, _EVERY_TURN, _EVERY_GRADIENT = 2, 10, 25
 CHECKS = ("sound", "linear", "units", "turned", "furnace", "gradient")
 _EXTREME = "extreme: "
 _MOST_DRAWS = 4  # random scenes a method is offered, for each that it shall take

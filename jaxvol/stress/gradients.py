@@ -94,25 +94,42 @@ def derivative(key: Any, stage: Stage, *, kind: type = np.float32) -> Slopes:
 
     `key` is the stage's in `recording`. float64 wants an enclosing `jax.enable_x64`.
     """
+    floats, others, along, outputs = _as_function(stage, kind)
+    if (key, kind) not in _compiled:
+        _compiled[key, kind] = jax.jit(partial(_with_slopes, outputs))
+    return Slopes(*jax.device_get(_compiled[key, kind](floats, others, along)))
+
+
+def differences(stage: Stage, *, step: float = 1e-7) -> list[np.ndarray]:
+    """Central differences, in float64, for the slopes of `derivative`; wants an enclosing `jax.enable_x64`.
+
+    They are not slopes where a stage draws or chooses by what is changed.
+    """
+    floats, others, along, outputs = _as_function(stage, np.float64)
+    run = jax.jit(outputs)
+    high, low = (jax.device_get(run([x + h * t for x, t in zip(floats, along, strict=True)], others)) for h in (step, -step))
+    return [(a - b) / (2 * step) for a, b in zip(high, low, strict=True)]
+
+
+def _as_function(stage, kind):
+    """Floating-point inputs as `kind`, other arrays, a direction of the former, and the outputs as a function of both."""
     leaves, tree = jax.tree.flatten(stage.arguments)
     floats = [np.asarray(x, kind) for x in leaves if _is_float(x)]
     others = [x for x in leaves if _is_array(x) and not _is_float(x)]
     rng = np.random.default_rng(0)
-    along = [_direction(x, rng) for x in floats]
-    if (key, kind) not in _compiled:
-        _compiled[key, kind] = jax.jit(partial(_with_slopes, stage.function, tree, leaves))
-    return Slopes(*jax.device_get(_compiled[key, kind](floats, others, along)))
+    return floats, others, [_direction(x, rng) for x in floats], partial(_outputs, stage.function, tree, leaves)
 
 
-def _with_slopes(function, tree, leaves, floats, others, along):
-    def outputs(floats):
-        given, rest = iter(floats), iter(others)
-        filled = [next(given) if _is_float(x) else next(rest) if _is_array(x) else x for x in leaves]
-        args, kwargs = jax.tree.unflatten(tree, filled)
-        found = [jnp.asarray(x) for x in jax.tree.leaves(function(*args, **kwargs))]
-        return [x for x in found if jnp.issubdtype(x.dtype, jnp.floating)]
+def _with_slopes(outputs, floats, others, along):
+    return jax.jvp(lambda floats: outputs(floats, others), (floats,), (along,))
 
-    return jax.jvp(outputs, (floats,), (along,))
+
+def _outputs(function, tree, leaves, floats, others):
+    given, rest = iter(floats), iter(others)
+    filled = [next(given) if _is_float(x) else next(rest) if _is_array(x) else x for x in leaves]
+    args, kwargs = jax.tree.unflatten(tree, filled)
+    found = [jnp.asarray(x) for x in jax.tree.leaves(function(*args, **kwargs))]
+    return [x for x in found if jnp.issubdtype(x.dtype, jnp.floating)]
 
 
 def _direction(x, rng):
