@@ -6,6 +6,7 @@ is run alone makes its own. Ray casters are kept with their meshes anyway (`ray_
 
 from functools import cached_property
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -39,7 +40,7 @@ class CommonStages:
     @cached_property
     def center_rays(self) -> Rays:
         """Rays through the centres of all pixels, row by row from the top."""
-        return cameras.generate_rays(self.camera, cameras.pixel_centers(self.camera))
+        return _center_rays(self.camera)
 
     @cached_property
     def center_hits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -52,3 +53,8 @@ class CommonStages:
     def edge_pixels(self) -> np.ndarray:
         """Pixels [H * W] that show more than one surface: one ray is not enough for them."""
         return pixel_edges.edge_pixels(self.scene.mesh, self.camera, self.caster, self.center_rays, self.center_hits)
+
+
+@jax.jit
+def _center_rays(camera):
+    return cameras.generate_rays(camera, cameras.pixel_centers(camera))

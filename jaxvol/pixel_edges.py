@@ -34,11 +34,17 @@ def edge_pixels(
     height, width = camera.height, camera.width
     if caster is None:
         return np.zeros(height * width, bool)
-    x, y = np.meshgrid(np.arange(width + 1, dtype=np.float32), np.arange(height + 1, dtype=np.float32))
-    rays = cameras.generate_rays(camera, jnp.asarray(np.stack([x, y], axis=-1).reshape(-1, 2)))
+    rays = _corner_rays(camera)
     t, face = ray_casting.intersect(caster, rays.origin, rays.direction, np.float32(np.inf))
     found = _differ(mesh, rays, t, face, center_rays, *center_hits, height=height, width=width)
     return np.asarray(found).reshape(-1)
+
+
+@jax.jit
+def _corner_rays(camera):
+    """Rays through the corners of all pixels, row by row."""
+    x, y = jnp.meshgrid(jnp.arange(camera.width + 1), jnp.arange(camera.height + 1))
+    return cameras.generate_rays(camera, jnp.stack([x, y], axis=-1).reshape(-1, 2).astype(jnp.float32))
 
 
 @partial(jax.jit, static_argnames=("height", "width"))

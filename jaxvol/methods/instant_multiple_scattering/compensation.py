@@ -7,8 +7,10 @@ forgets) plus the same residual again.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -16,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxvol import lights as primary
 from jaxvol import materials, media, phase, ray_casting, sampling
 from jaxvol.methods.instant_multiple_scattering import gathering, pairs, receivers
+from jaxvol.methods.instant_multiple_scattering.planning import Plan
 from jaxvol.methods.instant_multiple_scattering.receivers import Points
 from jaxvol.types import Hits, Medium, Scene
 
@@ -337,3 +340,10 @@ def most_clamp(scene: Scene, share: float) -> Float[Array, ""]:
         return jnp.float32(share)
     low, high = jnp.min(jnp.concatenate(corners), axis=0), jnp.max(jnp.concatenate(corners), axis=0)
     return share * jnp.max(high - low)
+
+
+@partial(jax.jit, static_argnames="plan")
+def clamp_at(scene: Scene, mip: Float[Array, "x y z"] | None, position: Float[Array, "*n 3"], *, plan: Plan):
+    """Clamp distance at points: a function of the receiver alone, one for all channels, so that the split is exact."""
+    sigma = local_sigma(scene.medium, mip, position)
+    return clamp_distance(sigma, mean_free_paths=plan.mean_free_paths, most=most_clamp(scene, plan.most_clamp))

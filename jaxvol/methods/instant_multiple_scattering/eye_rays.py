@@ -1,5 +1,7 @@
 """Eye rays: through pixels, jittered or not, and through blocks of pixels."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,13 +27,14 @@ def block_rays(context: Context, camera: Camera, rows: int, columns: int, *, fac
 
 def cast(context: Context, camera: Camera, xy: Float[Array, "n 2"], index: UInt[Array, "n"]) -> tuple:
     """Origins, directions, first hits (t, face) of the eye rays through `xy`, and the given numbers."""
-    rays = pinhole.generate_rays(camera, xy)
-    t = jnp.full(index.shape, jnp.inf, jnp.float32)
-    face = jnp.full(index.shape, -1, jnp.int32)
+    rays = _generate_rays(camera, xy)
+    t, face = np.full(index.shape, np.inf, np.float32), np.full(index.shape, -1, np.int32)
     if context.scene.mesh is not None:
         t, face = ray_casting.intersect(context.caster, rays.origin, rays.direction, t)
-        t, face = jnp.asarray(t), jnp.asarray(face)
-    return rays.origin, rays.direction, t, face, index
+    return rays.origin, rays.direction, jnp.asarray(t), jnp.asarray(face), index
+
+
+_generate_rays = jax.jit(pinhole.generate_rays)
 
 
 def lanes(pixels: UInt[np.ndarray, "n"], edges: Bool[np.ndarray, "HW"] | None, number: int) -> tuple:
@@ -64,18 +67,32 @@ def through_pixels(
     surfaces a jittered ray is one of 16 strata of the pixel, chosen in proportion to 1 - exp(-length * mean extinction)
     inside the medium: a pixel at the medium's edge is then not hit or missed by chance.
     """
+    scene, jitter = context.scene, context.plan.jitter
+    if not jitter or scene.mesh is not None or scene.medium is None:
+        xy, index = _places(camera, jnp.asarray(index), ray, context.seed, jitter=jitter)
+        return cast(context, camera, xy, index), np.float32(1.0)
     index = jnp.asarray(index)
-    xy = jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
-    if not context.plan.jitter:
-        return cast(context, camera, xy + 0.5, index), np.float32(1.0)
-    if context.scene.mesh is not None or context.scene.medium is None:
-        inside = jnp.stack(sampling.uniforms(context.seed, _PIXEL, index, 0)[:2], axis=-1)
-        if ray is not None:
-            inside = (inside + ray[:, None] * _RECURRENCE) % 1.0
-            index = index + ray * jnp.uint32(camera.height * camera.width)
-        return cast(context, camera, xy + inside, index), np.float32(1.0)
-    chosen, weight = choose_in_pixel(context.scene, camera, xy, index, context.seed)
+    chosen, weight = choose_in_pixel(scene, camera, _corners(camera, index), index, context.seed)
     return cast(context, camera, chosen, index), np.asarray(weight)[:, None]
+
+
+@jax.jit
+def _corners(camera, index):
+    """Upper left corners of pixels."""
+    return jnp.stack([index % camera.width, index // camera.width], axis=-1).astype(jnp.float32)
+
+
+@partial(jax.jit, static_argnames="jitter")
+def _places(camera, index, ray, seed, *, jitter):
+    """Places in pixels, and numbers that no two rays share."""
+    corner = _corners(camera, index)
+    if not jitter:
+        return corner + 0.5, index
+    inside = jnp.stack(sampling.uniforms(seed, _PIXEL, index, 0)[:2], axis=-1)
+    if ray is None:
+        return corner + inside, index
+    inside = (inside + ray[:, None] * _RECURRENCE) % 1.0
+    return corner + inside, index + ray * jnp.uint32(camera.height * camera.width)
 
 
 @jax.jit

@@ -179,6 +179,7 @@ def _chosen(lights, index):
     return jax.tree.map(lambda x: x[index], gathering.rows(lights))
 
 
+@jax.jit
 def shadow_rays(
     position: Float[Array, "*k n 3"], lights: VirtualLights, picks: Picks
 ) -> tuple[Float[Array, "k n 3"], Float[Array, "k n 3"], Float[Array, "k n"]]:
@@ -188,6 +189,7 @@ def shadow_rays(
     return jnp.broadcast_to(position, delta.shape), delta / length[..., None], length * (1.0 - 1e-4)
 
 
+@jax.jit
 def points_of(segments: Segments, picks: Picks) -> Float[Array, "k n 3"]:
     """Where the eye rays meet their picked lights."""
     return segments.origin + picks.t[..., None] * segments.direction

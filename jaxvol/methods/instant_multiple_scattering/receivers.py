@@ -33,6 +33,19 @@ class Points(eqx.Module):
     surface: materials.Surface | None = None
 
 
+def with_clamp(points: Points, clamp: Float[Array, "n"] | None) -> Points:
+    """The same points with another clamp distance."""
+    return Points(
+        points.position,
+        points.outgoing,
+        points.scattering,
+        clamp,
+        points.on_surface,
+        points.normal,
+        points.surface,
+    )
+
+
 @jax.jit
 def lifted(scene: Scene, points: Points) -> Float[Array, "n 3"]:
     """Points, those on surfaces moved off them to the side of `outgoing`."""

@@ -113,21 +113,16 @@ def gather_rays(
 ) -> dict[str, Float[Array, "n 3"]]:
     """The six layers along eye rays whose first hits (t, face) are given; `index` numbers them for random numbers."""
     plan = context.plan
-    result = {name: jnp.zeros(origin.shape, jnp.float32) for name in NAMES}
+    result = dict.fromkeys(NAMES, jnp.zeros(origin.shape, jnp.float32))
     if plan.volume:
-        _add(result, "volume", _volume(context, origin, direction, t, index))
+        result |= _named("volume", _volume(context, origin, direction, t, index))
     if plan.surface:
-        _add(result, "surface", _surface(context, origin, direction, t, face, index))
+        result |= _named("surface", _surface(context, origin, direction, t, face, index))
     return result
 
 
-def _add(result, last, sums):
-    for term in _TERMS:
-        result[f"{last}_from_{term}"] = result[f"{last}_from_{term}"] + sums[term]
-
-
-def _scaled(sums, scale):
-    return {name: value * scale for name, value in sums.items()}
+def _named(last, sums):
+    return {f"{last}_from_{term}": sums[term] for term in _TERMS}
 
 
 def _chains(context, points_for, index):
@@ -144,7 +139,7 @@ def _chains(context, points_for, index):
         def add_chain(chain, total, number=number, lit=lit, first=first):
             points, throughput = points_for(chain, number, first)
             found = stages.compensate(context, points, throughput, index, chain=first + chain, lit=lit)
-            return {name: total[name] + found[name] / number for name in total}
+            return _plus(total, found, 1.0 / number)
 
         if context.scene.mesh is None:
             total = lax.fori_loop(0, number, add_chain, total)
@@ -152,6 +147,12 @@ def _chains(context, points_for, index):
             for chain in range(number):
                 total = add_chain(chain, total)
     return total
+
+
+@jax.jit
+def _plus(sums, others, scale):
+    """Light so far, and a share of more."""
+    return {name: sums[name] + others[name] * scale for name in sums}
 
 
 def _volume(context, origin, direction, t, index):
@@ -172,33 +173,40 @@ def _volume_in_steps(context, origin, direction, t, index):
     gathered = stages.gather_segments(context, segments, index)
 
     def eye(chain, number, first):
-        u = sampling.uniforms(context.seed, _PIXEL, index, 2)
-        along, kind = gathering.shifted(u[0], chain / number), gathering.shifted(u[1], 0.5 * chain)
+        along, kind = _eye_uniforms(context.seed, index, chain / number, 0.5 * chain)
         return stages.eye_vertices(context, segments, along, kind, index, chain=first + chain)
 
-    residual = _chains(context, eye, index)
-    return {name: gathered[name] + residual[name] for name in gathered}
+    return _plus(gathered, _chains(context, eye, index), 1.0)
+
+
+@jax.jit
+def _eye_uniforms(seed, index, *shifts):
+    u = sampling.uniforms(seed, _PIXEL, index, 2)
+    return tuple(gathering.shifted(x, shift) for x, shift in zip(u, shifts, strict=False))
 
 
 def _surface(context, origin, direction, t, face, index):
-    scene, plan = context.scene, context.plan
+    points, tau, u = _reflecting(context.scene, context.mip, origin, direction, t, face, index, context.seed, plan=context.plan)
+    gathered = stages.gather_points(context, points, u, stride=1, offset=0)
+    residual = _chains(context, lambda *_: (points, tau), index + jnp.uint32(0x40000000))
+    return _plus(residual, gathered, tau)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _reflecting(scene, mip, origin, direction, t, face, index, seed, *, plan):
+    """Points where eye rays meet surfaces, the transmittance to them (0: none met), and a uniform."""
     hit = ray_casting.hits(scene.mesh, origin, direction, t, face)
     tau = jnp.ones(origin.shape, jnp.float32)
     if scene.medium is not None:
-        segments = stages.segments_of(context, origin, direction, jnp.where(hit.valid, hit.t, 0.0))
+        segments = stages.segments(scene, mip, origin, direction, jnp.where(hit.valid, hit.t, 0.0), plan=plan)
         column = segments.t1 - segments.t0 if segments.column is None else segments.column[-1]
         tau = jnp.exp(-column[:, None] * media.sigma_t(scene.medium))
     tau = jnp.where(hit.valid[:, None], tau, 0.0)
-    clamp = None
-    if plan.mean_free_paths is not None:
-        clamp = stages.clamp_at(scene, context.mip, hit.position, plan=plan)
+    clamp = None if plan.mean_free_paths is None else compensation.clamp_at(scene, mip, hit.position, plan=plan)
     nothing = jnp.zeros(origin.shape, jnp.float32)
     surface = materials.surface_at(scene.mesh, face)
     points = Points(hit.position, -direction, nothing, clamp, hit.valid, hit.normal, surface)
-    u = sampling.uniforms(context.seed, _PIXEL, index, 3)[0]
-    gathered = _scaled(stages.gather_points(context, points, u, stride=1, offset=0), tau)
-    residual = _chains(context, lambda *_: (points, tau), index + jnp.uint32(0x40000000))
-    return {name: gathered[name] + residual[name] for name in gathered}
+    return points, tau, sampling.uniforms(seed, _PIXEL, index, 3)[0]
 
 
 def render_set(

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, UInt
 from scipy.spatial import cKDTree
 
@@ -59,6 +60,9 @@ def zero_sums(n: int) -> Sums:
     return {name: jnp.zeros((n, 3), jnp.float32) for name in ("surface", "volume", "multiple")}
 
 
+_uniforms = jax.jit(sampling.uniforms, static_argnums=1)
+
+
 def _groups(block: VirtualLights, size: int) -> int:
     return max(1, -(-block.position.shape[0] // size))
 
@@ -70,11 +74,20 @@ def segments_of(
     t_end: Float[Array, "n"],
 ) -> Segments:
     """The part of eye rays inside the medium and before `t_end`, with clamp distance and, in a grid, their table."""
-    return _segments(context.scene, context.mip, origin, direction, jnp.asarray(t_end), plan=context.plan)
+    return segments(context.scene, context.mip, origin, direction, jnp.asarray(t_end), plan=context.plan)
 
 
 @partial(jax.jit, static_argnames="plan")
-def _segments(scene, mip, origin, direction, t_end, *, plan):
+def segments(
+    scene: Scene,
+    mip: Float[Array, "x y z"] | None,
+    origin: Float[Array, "n 3"],
+    direction: Float[Array, "n 3"],
+    t_end: Float[Array, "n"],
+    *,
+    plan: Plan,
+) -> Segments:
+    """What `segments_of` gives."""
     medium = scene.medium
     t0, t1 = media.box_interval(medium.bounds, origin, direction)
     t1 = jnp.maximum(jnp.minimum(t1, t_end), t0)
@@ -84,27 +97,18 @@ def _segments(scene, mip, origin, direction, t_end, *, plan):
         clamp = compensation.clamp_distance(
             thickest, mean_free_paths=plan.mean_free_paths, most=compensation.most_clamp(scene, plan.most_clamp)
         )
-    segments = Segments(origin, direction, t0, t1, clamp)
+    found = Segments(origin, direction, t0, t1, clamp)
     if medium.density is None:
-        return segments
-    column = receivers.columns_along(segments, medium, num_steps=plan.eye_steps)
+        return found
+    column = receivers.columns_along(found, medium, num_steps=plan.eye_steps)
     return Segments(origin, direction, t0, t1, clamp, column)
-
-
-@partial(jax.jit, static_argnames="plan")
-def clamp_at(scene: Scene, mip: Float[Array, "x y z"] | None, position: Float[Array, "n 3"], *, plan: Plan):
-    """Clamp distance at points: a function of the receiver alone, one for all channels, so that the split is exact."""
-    sigma = compensation.local_sigma(scene.medium, mip, position)
-    return compensation.clamp_distance(
-        sigma, mean_free_paths=plan.mean_free_paths, most=compensation.most_clamp(scene, plan.most_clamp)
-    )
 
 
 def gather_segments(context: Context, segments: Segments, index: UInt[Array, "n"]) -> Sums:
     """Clamped (or unclamped) light of all virtual lights along eye rays."""
     plan, medium = context.plan, context.scene.medium
     sums = zero_sums(index.shape[0])
-    u = sampling.uniforms(context.seed, _EYE, index, 0)
+    u = _uniforms(context.seed, _EYE, index, 0)
     stratified = plan.sampling == "stratified"
     if context.rays is not None:
         for name in ("volume", "multiple"):
@@ -126,7 +130,7 @@ def gather_segments(context: Context, segments: Segments, index: UInt[Array, "n"
                 num_evaluations=plan.num_evaluations,
             )
         else:
-            u_group = sampling.uniforms(context.seed, _EYE, index, 1 + number)[0]
+            u_group = _uniforms(context.seed, _EYE, index, 1 + number)[0]
             picks = picking.pick_for_segments(
                 segments,
                 u[0],
@@ -147,7 +151,7 @@ def _evaluate_segments(context, segments, picks, name, block):
     position = picking.points_of(segments, picks)
     clamps = None
     if context.mip is not None and plan.mean_free_paths is not None:
-        clamps = clamp_at(context.scene, context.mip, position, plan=plan)
+        clamps = compensation.clamp_at(context.scene, context.mip, position, plan=plan)
     visible, columns = _between(context, picks, position, position, name, block)
     return picking.evaluate_segments(
         segments,
@@ -171,7 +175,7 @@ def _between(context, picks, position, origin, name, block, *, stride=1, offset=
     plan = context.plan
     index = None
     if context.maps is not None:
-        index = maps.first_rows(context.lights)[name] + picks.light * stride + offset % stride
+        index = maps.first_rows(context.lights)[name] + picks.light * stride + offset
         position = jnp.broadcast_to(position, (*index.shape, 3))
     visible, columns = None, None
     if context.scene.mesh is not None:
@@ -179,19 +183,22 @@ def _between(context, picks, position, origin, name, block, *, stride=1, offset=
             visible = maps.visible(context.maps, index, position)
         else:
             rays = picking.shadow_rays(origin, block, picks)
-            visible = ~jnp.asarray(ray_casting.occluded(context.caster, *rays))
+            visible = jnp.asarray(~np.asarray(ray_casting.occluded(context.caster, *rays)))
     if plan.columns == "maps":
         columns = maps.column(context.maps, index, position)
     return visible, columns
 
 
 def gather_points(context: Context, points: Points, u: Float[Array, "n"], *, stride: int, offset: ArrayLike) -> Sums:
-    """Clamped (points.clamp None: unclamped) light of one of `stride` virtual lights, weighted up, at points."""
+    """Clamped (points.clamp None: unclamped) light of one of `stride` virtual lights, weighted up, at points.
+
+    `offset` says which, 0 ... stride - 1.
+    """
     plan, medium = context.plan, context.scene.medium
     sums = zero_sums(u.shape[0])
     for name, block in blocks(context.lights):
         if stride > 1:
-            block = virtual_lights.subset(block, jnp.int32(offset % stride), stride=stride)
+            block = virtual_lights.subset(block, offset, stride=stride)
         if not plan.costly:
             value = gathering.gather_points(points, block, medium, grey=plan.grey, isotropic=plan.isotropic)
         else:
@@ -236,7 +243,7 @@ def _eye_vertices(scene, mip, segments, u, u_kind, u_light, *, plan):
     column = receivers.column_at(segments, t)
     throughput = inverse_pdf[:, None] * jnp.exp(-column[:, None] * extinction)
     scattering = jnp.broadcast_to(medium.sigma_s, position.shape)
-    clamp = clamp_at(scene, mip, position, plan=plan)
+    clamp = compensation.clamp_at(scene, mip, position, plan=plan)
     points = Points(position, -segments.direction, scattering, clamp)
     if scene.mesh is not None:
         nowhere = jnp.full(t.shape, -1, jnp.int32)
@@ -285,7 +292,7 @@ def _add_primary(context, sums, arguments, *, first):
     visible = None
     if scene.mesh is not None:
         short = sample.distance * (1.0 - 1e-4)
-        visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
+        visible = jnp.asarray(~np.asarray(ray_casting.occluded(context.caster, origin, sample.direction, short)))
     return _book_direct(scene, sums, found, throughput, sample, visible, jnp.bool_(first), plan=plan)
 
 
@@ -298,11 +305,17 @@ def _gather_at_end(context, points, u, chain, level):
     """Light of a random share of the virtual lights at new vertices; the last ones may be clamped less."""
     plan = context.plan
     if level == plan.num_levels - 1 and plan.end != "clamped":
-        points = with_clamp(points, None if plan.end == "unclamped" else _REDUCED * points.clamp)
-    mixed = jnp.uint32(context.seed) ^ jnp.uint32(_SHARE)
-    hashed = sampling.pcg4d(jnp.uint32(chain), jnp.uint32(level), jnp.uint32(0), mixed)[0]
-    offset = (hashed % jnp.uint32(plan.light_stride)).astype(jnp.int32)
+        points = receivers.with_clamp(points, None if plan.end == "unclamped" else _REDUCED * points.clamp)
+    offset = _share(context.seed, chain, level, stride=plan.light_stride)
     return gather_points(context, points, u, stride=plan.light_stride, offset=offset)
+
+
+@partial(jax.jit, static_argnames="stride")
+def _share(seed, chain, level, *, stride):
+    """Which of `stride` shares of the lights a new vertex gathers from."""
+    mixed = jnp.asarray(seed, jnp.uint32) ^ jnp.uint32(_SHARE)
+    hashed = sampling.pcg4d(jnp.asarray(chain, jnp.uint32), jnp.asarray(level, jnp.uint32), jnp.uint32(0), mixed)[0]
+    return (hashed % jnp.uint32(stride)).astype(jnp.int32)
 
 
 @jax.jit
@@ -333,7 +346,7 @@ def _advance(scene, mip, points, proposal, throughput, s, face, u, *, plan):
     found, gain = compensation.new_vertices(
         scene, points, proposal, step, t, factor, sigma, even, transmittance=plan.transmittance, num_steps=_steps_within(plan)
     )
-    found = with_clamp(found, clamp_at(scene, mip, found.position, plan=plan))
+    found = receivers.with_clamp(found, compensation.clamp_at(scene, mip, found.position, plan=plan))
     return found, throughput * gain
 
 
@@ -370,19 +383,6 @@ def _book_direct(scene, sums, points, throughput, sample, visible, first, *, pla
         "volume": sums["volume"] + jnp.where(first & ~on, value, 0.0),
         "multiple": sums["multiple"] + jnp.where(first, 0.0, value),
     }
-
-
-def with_clamp(points: Points, clamp: Float[Array, "n"] | None) -> Points:
-    """The same points with another clamp distance."""
-    return Points(
-        points.position,
-        points.outgoing,
-        points.scattering,
-        clamp,
-        points.on_surface,
-        points.normal,
-        points.surface,
-    )
 
 
 def _surface_within(context, points, proposal):

@@ -100,3 +100,12 @@ def test_few_lights_stay_as_they_are():
     assert selection.select(scene, None, camera, lights, plan, seed=1) is lights
     with pytest.raises(ValueError, match="max_lights"):
         ims.plan(scene, camera, max_lights=3)
+
+
+def test_kinds_of_like_number_share_a_size():
+    """Both in the medium, both on surfaces: one program instead of two, unless one kind would take much from the other."""
+    counts = {"volume_first": 200, "volume_later": 390, "surface_first": 100, "surface_later": 310}
+    sizes = selection.even_counts(counts)
+    assert sizes["volume_first"] == sizes["volume_later"] == virtual_lights.capacity(295)
+    assert sizes["surface_first"] == virtual_lights.capacity(100) < sizes["surface_later"] == virtual_lights.capacity(310)
+    assert selection.even_counts({"volume_first": 70}) == {"volume_first": virtual_lights.capacity(70)}
