@@ -71,8 +71,8 @@ def connect(
 ) -> Connections:
     """Connections from hits towards the scene's one light, the estimator's weights and BSDF multiplied in."""
     surface, normal, offset = _common(scene, incoming, hits)
-    found = []
-    for k in range(num_light):
+
+    def one(k):
         index = (sample * num_light + k).astype(jnp.uint32)
         if faces is not None:
             light = emitters.sample(faces, hits.position, *patterns.shifted(seed, pixel, index, _LIGHT_SET, 2))
@@ -87,8 +87,14 @@ def connect(
             weight = weight / (1.0 + num_bsdf / num_light * other / jnp.where(light.pdf > 0, light.pdf, 1.0))
         weight = jnp.where(light.pdf > 0, weight, 0.0)
         value = _reflected(surface, incoming, hits, normal, light.direction) * light.radiance * weight[:, None]
-        found.append((*_aim(offset(light.direction), light), value))
-    return Connections(*(jnp.stack(part) for part in zip(*found, strict=True)))
+        return (*_aim(offset(light.direction), light), value)
+
+    return Connections(*_each(one, num_light))
+
+
+def _each(one, number):
+    """one(k) for k = 0 .. number - 1, stacked; one copy of its code (a copy for each k took seconds to compile)."""
+    return jax.vmap(one)(jnp.arange(number, dtype=jnp.int32))
 
 
 def _sample_sky(environment, guide, u1, u2):
@@ -121,25 +127,27 @@ def connect_along_bsdf(
 ) -> Connections:
     """Connections to the environment in directions sampled from the BSDF."""
     surface, normal, offset = _common(scene, incoming, hits)
-    found = []
-    for k in range(num_bsdf):
+
+    def one(k):
         direction, pdf = _bsdf_directions(surface, incoming, hits, pixel, sample, seed, k, num_bsdf)
         other = lights.sample_environment_pdf(guide, direction)
         weight = jnp.where(pdf > 0, 1.0 / (num_bsdf * pdf + num_light * other), 0.0)
         radiance = lights.environment_radiance(scene.environment, direction)
         value = _reflected(surface, incoming, hits, normal, direction) * radiance * weight[:, None]
-        found.append((offset(direction), direction, jnp.full(pdf.shape, jnp.inf, jnp.float32), value))
-    return Connections(*(jnp.stack(part) for part in zip(*found, strict=True)))
+        return offset(direction), direction, jnp.full(pdf.shape, jnp.inf, jnp.float32), value
+
+    return Connections(*_each(one, num_bsdf))
 
 
 @partial(jax.jit, static_argnames=("num_bsdf",))
 def _casts_along_bsdf(scene, incoming, hits, pixel, sample, seed, *, num_bsdf):
     surface, _, offset = _common(scene, incoming, hits)
-    found = []
-    for k in range(num_bsdf):
+
+    def one(k):
         direction, pdf = _bsdf_directions(surface, incoming, hits, pixel, sample, seed, k, num_bsdf)
-        found.append((offset(direction), direction, pdf))
-    return tuple(jnp.stack(part) for part in zip(*found, strict=True))
+        return offset(direction), direction, pdf
+
+    return _each(one, num_bsdf)
 
 
 @partial(jax.jit, static_argnames=("num_light", "num_bsdf"))
