@@ -143,7 +143,10 @@ def _direction(x, rng):
 def finite(stages: dict[Any, Stage]) -> str | None:
     """Whether every slope is finite where its value is; None where all are."""
     for key, stage in stages.items():
-        found = derivative(key, stage)
+        try:
+            found = derivative(key, stage)
+        except (RuntimeError, TypeError, ValueError) as error:  # what cannot be differentiated at all
+            return f"{stage.name}: raised {type(error).__name__}: {error}"
         for number, (value, slope) in enumerate(zip(*found, strict=True)):
             bad = np.isfinite(value) & ~np.isfinite(slope)
             if bad.any():

@@ -28,6 +28,8 @@ from jaxvol.methods.lattice_boltzmann.lattice import Lattice, ProbabilityMap, be
 from jaxvol.methods.lattice_boltzmann.materials import forward_part
 from jaxvol.methods.lattice_boltzmann.sweeps import move_plane
 
+_DARK = 1e-18  # of the light that is marched, which is about 1; its square is a normal number
+
 
 class Moments(NamedTuple):
     """Moments of the scattered light, fluence * h^2 [W]: Y_0 = 1, then sqrt(3) (x, y, z), ...; how the solve went."""
@@ -152,11 +154,14 @@ def first_collisions(
 
 def mean_direction(track, flow):
     """(unit mean direction, its length before normalisation in 0..1) from fluence and flow; z where it is dark."""
-    size = jnp.sqrt(flow[0] * flow[0] + flow[1] * flow[1] + flow[2] * flow[2])
-    lit = size > 1e-20
-    safe = jnp.where(lit, size, 1.0)
-    heading = (jnp.where(lit, flow[0] / safe, 0.0), jnp.where(lit, flow[1] / safe, 0.0), jnp.where(lit, flow[2] / safe, 1.0))
-    straightness = jnp.where(lit, jnp.minimum(size / jnp.maximum(track, 1e-20), 1.0), 0.0)
+    squared = flow[0] * flow[0] + flow[1] * flow[1] + flow[2] * flow[2]
+    lit = squared > _DARK * _DARK
+    size = jnp.sqrt(jnp.where(lit, squared, 1.0))
+    heading = (jnp.where(lit, flow[0] / size, 0.0), jnp.where(lit, flow[1] / size, 0.0), jnp.where(lit, flow[2] / size, 1.0))
+    # where interpolation leaves a flow but no track, it is straight
+    known = track > _DARK
+    ratio = jnp.where(known, size / jnp.where(known, track, 1.0), 1.0)
+    straightness = jnp.where(lit, jnp.minimum(ratio, 1.0), 0.0)
     return heading, straightness
 
 
@@ -178,12 +183,12 @@ def solve(
     strength = jnp.stack([scattering * scale[l] for l in orders(degree)])
     apply = lambda s: transport(lattice, extinction, s, degree=degree, kind=kind)  # noqa: E731
     right = apply(sources)
-    size = jnp.sqrt(jnp.sum(right * right))
+    size = _norm(right)
     unit = right / jnp.where(size > 0, size, 1.0)
     # diffusion follows the transport cross-section, and only the fluence is diffusive
     reduced = extinction - scattering * scale[1] if degree else extinction
     levels = lax.stop_gradient(preconditioner.build(extinction.shape, reduced, absorption))
-    frozen = lax.stop_gradient(scattering)
+    frozen, tolerance = lax.stop_gradient((scattering, tolerance))
 
     def precondition(r):
         return r.at[0].add(preconditioner.v_cycle(levels, frozen * r[0]))
@@ -197,9 +202,11 @@ def solve(
         throw=False,
     )
     moments = right + apply(strength * (answer.value * size))
-    residual = _norm(unit + apply(strength * answer.value) - answer.value)
+    residual = lax.stop_gradient(_norm(unit + apply(strength * answer.value) - answer.value))
     return Moments(moments, 2 * answer.stats["num_steps"] + 2, residual, residual <= 3.0 * tolerance)
 
 
 def _norm(x):
-    return jnp.sqrt(jnp.sum(x * x))
+    """Length of x, with slope 0 where all is 0."""
+    squared = jnp.sum(x * x)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

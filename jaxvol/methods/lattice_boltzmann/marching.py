@@ -139,7 +139,8 @@ def _straight_round(extinction, shape, num_steps, rays, track):
         nearest = jnp.minimum(jnp.minimum(rays.t_next[0], rays.t_next[1]), rays.t_next[2])
         stop = jnp.minimum(nearest, rays.t_end)
         length = jnp.maximum(stop - rays.t, 0.0)
-        heading = tuple(s / jnp.maximum(t, 1e-30) for s, t in zip(rays.step, rays.t_step, strict=True))  # 0 of padding
+        # 0 of padding
+        heading = tuple(jnp.where(t > 0, s / jnp.where(t > 0, t, 1.0), 0.0) for s, t in zip(rays.step, rays.t_step, strict=True))
         power, track = _absorb(extinction, track, rays.power, at, length, heading)
         crossed = nearest < rays.t_end
         moves = [(rays.t_next[a] <= nearest) & crossed for a in range(3)]

@@ -92,7 +92,7 @@ def _solve(lattice, coefficients, deposit, tolerance, max_steps, levels):
     )
     u = answer.value
     phi = transport(lattice, coefficients, root * u + deposit)
-    residual = jnp.sqrt(jnp.sum((u - root * phi) ** 2)) / scale
+    residual = jax.lax.stop_gradient(jnp.sqrt(jnp.sum((u - root * phi) ** 2)) / scale)  # at 0 it has no slope
     return Solution(
         phi_first=phi_first,
         phi=phi,
