@@ -140,7 +140,9 @@ def _straight_round(extinction, shape, num_steps, rays, track):
         stop = jnp.minimum(nearest, rays.t_end)
         length = jnp.maximum(stop - rays.t, 0.0)
         # 0 of padding
-        heading = tuple(jnp.where(t > 0, s / jnp.where(t > 0, t, 1.0), 0.0) for s, t in zip(rays.step, rays.t_step, strict=True))
+        heading = tuple(
+            jnp.where(t > 0, s / jnp.where(t > 0, t, 1.0), 0.0) for s, t in zip(rays.step, rays.t_step, strict=True)
+        )
         power, track = _absorb(extinction, track, rays.power, at, length, heading)
         crossed = nearest < rays.t_end
         moves = [(rays.t_next[a] <= nearest) & crossed for a in range(3)]
