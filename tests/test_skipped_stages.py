@@ -35,7 +35,7 @@ def light_march(monkeypatch, scene, plan):
 
 
 def test_a_grey_lattice_marches_and_solves_one_channel(monkeypatch):
-    """One field of track and one exponential a step instead of three; one solve; one column of light for the view."""
+    """One field of track and one exponential a step instead of three, one solve."""
     found = []
     for scene, _, plan in prepared(skip_named("grey, lattice")):
         name, march = light_march(monkeypatch, scene, plan)
@@ -72,7 +72,7 @@ def test_a_medium_of_albedo_0_has_no_lattice(monkeypatch):
 
 
 def test_without_an_index_rays_are_straight(monkeypatch):
-    """No index, no gradient of it among the voxels' fields, no interpolation in the march; eye rays go straight too."""
+    """No index, no gradient of it among the voxels' fields, no interpolation in the march."""
     (scene, _, plan), (bent, _, curved) = prepared(skip_named("no refraction"))
     (name, ours), (other, theirs) = (light_march(monkeypatch, *side) for side in ((scene, plan), (bent, curved)))
     assert (name, other) == ("_straight_round", "_bent_round")

@@ -38,24 +38,15 @@ _generate_rays = jax.jit(pinhole.generate_rays)
 
 
 def lanes(pixels: UInt[np.ndarray, "n"], edges: Bool[np.ndarray, "HW"] | None, number: int) -> tuple:
-    """(pixel, ray of it) of all eye rays: one for each of `pixels`, then the others of the `number` where `edges` says so.
-
-    The others of one pixel follow each other. Without jitter all rays of a pixel would be one: `edges` is None then.
-    """
+    """(pixel, ray of it, share of it) of eye rays: one for each of `pixels`, then `number` - 1 more for those at `edges`."""
     more = np.zeros(0, np.uint32) if edges is None else pixels[edges[pixels]]
-    ray = np.tile(np.arange(1, number, dtype=np.uint32), len(more))
     pixel = np.concatenate([pixels, np.repeat(more, number - 1)])
-    return pixel, np.concatenate([np.zeros(len(pixels), np.uint32), ray])
-
-
-def mean_over_rays(values: Float[np.ndarray, "m 3"], pixels: UInt[np.ndarray, "n"], edges, number: int) -> np.ndarray:
-    """One value for each of `pixels` from those of `lanes`, [n, 3]."""
-    first, others = values[: len(pixels)], values[len(pixels) :]
-    if not len(others):
-        return first
-    mean, chosen = first.copy(), edges[pixels]
-    mean[chosen] = (first[chosen] + others.reshape(-1, number - 1, 3).sum(axis=1)) / number
-    return mean
+    ray = np.zeros(len(pixel), np.uint32)
+    ray[len(pixels) :] = np.tile(np.arange(1, number), len(more))
+    share = np.ones(len(pixel), np.float32)
+    if len(more):
+        share[edges[pixel]] = 1.0 / number
+    return pixel, ray, share
 
 
 def through_pixels(

@@ -248,20 +248,20 @@ def _computed(plan):
 
 def _evaluate(context, camera, index, result, edges=None):
     """All layers at the pixels `index`, tile by tile, into `result`."""
-    number, names = context.plan.edge_rays, _computed(context.plan)
-    pixel, ray = eye_rays.lanes(index, edges, number)
-    found = {name: np.zeros((len(pixel), 3), np.float32) for name in names}
+    names = _computed(context.plan)
+    pixel, ray, share = eye_rays.lanes(index, edges, context.plan.edge_rays)
+    for name in names:
+        result[name][index] = 0.0
     size = min(context.plan.tile, virtual_lights.capacity(len(pixel)))
     for begin in range(0, len(pixel), size):
-        count = min(size, len(pixel) - begin)
         part = np.minimum(np.arange(begin, begin + size), len(pixel) - 1)
         others = None if edges is None else jnp.asarray(ray[part])
         rays, weight = eye_rays.through_pixels(context, camera, jnp.asarray(pixel[part]), ray=others)
         values = gather_rays(context, *rays)
+        real = slice(None, len(pixel) - begin)
+        weight = (weight * share[part, None])[real]
         for name in names:
-            found[name][begin : begin + count] = (np.asarray(values[name]) * weight)[:count]
-    for name in names:
-        result[name][index] = eye_rays.mean_over_rays(found[name], index, edges, number)
+            np.add.at(result[name], pixel[part][real], np.asarray(values[name])[real] * weight)
 
 
 def _from_low_resolution(context, camera, result, counts):

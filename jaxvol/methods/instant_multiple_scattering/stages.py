@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, UInt
 from scipy.spatial import cKDTree
 
@@ -183,7 +182,7 @@ def _between(context, picks, position, origin, name, block, *, stride=1, offset=
             visible = maps.visible(context.maps, index, position)
         else:
             rays = picking.shadow_rays(origin, block, picks)
-            visible = jnp.asarray(~np.asarray(ray_casting.occluded(context.caster, *rays)))
+            visible = jnp.asarray(~ray_casting.occluded(context.caster, *rays))
     if plan.columns == "maps":
         columns = maps.column(context.maps, index, position)
     return visible, columns
@@ -292,7 +291,7 @@ def _add_primary(context, sums, arguments, *, first):
     visible = None
     if scene.mesh is not None:
         short = sample.distance * (1.0 - 1e-4)
-        visible = jnp.asarray(~np.asarray(ray_casting.occluded(context.caster, origin, sample.direction, short)))
+        visible = jnp.asarray(~ray_casting.occluded(context.caster, origin, sample.direction, short))
     return _book_direct(scene, sums, found, throughput, sample, visible, jnp.bool_(first), plan=plan)
 
 

@@ -195,16 +195,16 @@ def test_rays_at_edges_are_averaged_over_their_pixel():
     scene, camera = lamp_behind_a_board(), make_camera(8)
     pixels, number = np.arange(64, dtype=np.uint32), 64
     edges = CommonStages(scene, camera).edge_pixels
-    pixel, ray = eye_rays.lanes(pixels, edges, number)
+    pixel, ray, share = eye_rays.lanes(pixels, edges, number)
     assert len(pixel) == 64 + 8 * 63 and np.bincount(pixel)[edges].tolist() == [number] * 8
     plan = ims.plan(scene, camera, edge_rays=number)
     context = stages.Context(scene, ray_casting.caster_for(scene.mesh), LightSet(), None, plan, 1, scene.medium)
     (_, _, t, _, index), weight = eye_rays.through_pixels(context, camera, pixel, ray=ray)
     assert len(np.unique(np.asarray(index))) == len(pixel) and weight == 1.0
-    covered = np.repeat((np.asarray(t) < 4.5)[:, None], 3, axis=1).astype(np.float32)  # the board, not the wall
-    mean = eye_rays.mean_over_rays(covered, pixels, edges, number)[:, 0].reshape(8, 8)
-    share = 0.5 * 8 * 0.04 / (4.0 * np.tan(0.3))  # of the row above the middle
-    np.testing.assert_allclose(mean[3], share, atol=0.02)
+    np.testing.assert_allclose(np.bincount(pixel, share), 1.0, rtol=1e-6)
+    mean = np.bincount(pixel, share * (np.asarray(t) < 4.5)).reshape(8, 8)  # the board, not the wall
+    covered = 0.5 * 8 * 0.04 / (4.0 * np.tan(0.3))  # of the row above the middle
+    np.testing.assert_allclose(mean[3], covered, atol=0.02)
     assert np.all(mean[:3] == 0) and np.all(mean[4:] == 1)
 
 
