@@ -20,7 +20,7 @@ _STATUS = Path("/proc/self/status")
 _WARM = 0.05  # share of a call that may go into tracing and compiling
 _CLEAR = Path("/proc/self/clear_refs")
 _MAPS = Path("/proc/self/maps")
-_MANY_MAPS = 16_000  # Linux allows a process 65,530; every program takes several
+_MANY_MAPS = 8_000  # Linux allows a process 65,530; programs of a scene take up to 20,000 in each of two processes
 
 
 @dataclass(frozen=True)
