@@ -28,7 +28,7 @@ def distance(a, b):
     a, b = (np.concatenate([np.zeros(0), *(np.asarray(x, np.float64).ravel() for x in y)]) for y in (a, b))
     both = np.isfinite(a) & np.isfinite(b)
     size = np.abs(b[both]).sum()
-    return float(np.abs(a - b)[both].sum() / size) if size > 0 else 0.0
+    return float(np.abs(a[both] - b[both]).sum() / size) if size > 0 else 0.0
 
 
 def stages_of(method, config):
