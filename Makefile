@@ -20,7 +20,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 render: $(INSTALLED)  ## a fog-filled Cornell box (or SCENE=file.toml) by the methods that suit it, the reference beside it, into out/
 	$(BIN)/jaxvol render $(SCENE) --method auto --beside path_tracing --samples 32 $(SIZE) --out out
 
-pictures: $(INSTALLED)  ## the README's pictures; a quarter of an hour, goes on where it was stopped
+pictures: $(INSTALLED)  ## the README's pictures; some ten minutes, goes on where it was stopped
 	for scene in cornell_fog cloud plume; do \
 		$(BIN)/jaxvol render experiments/scenes/$$scene.toml --samples 512 --out out/pictures || exit 1; \
 		cp out/pictures/$$scene.png docs/images/; \
