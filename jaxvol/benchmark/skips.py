@@ -38,7 +38,7 @@ class Skip:
     absent: Config  # the same without the skip
     options: Config = field(default_factory=dict)  # of both: the method's, for "auto" those of [render]
     without: Config = field(default_factory=dict)  # more options, of the second
-    equal: float | None = 1e-3  # relative L1 within which the pictures agree; None: they differ by noise, or by intent
+    equal: float | None = 1e-3  # relative L1 within which the pictures agree; None: they differ by noise, means are compared
 
     def render(self, options: Config) -> Config:
         """A [render] table with these options."""
@@ -147,7 +147,7 @@ SKIPS: tuple[Skip, ...] = (
     Skip(
         "albedo 0 of the medium", "lattice_boltzmann", "the lattice",
         _scene(medium=_medium(scattering=0.0, anisotropy=0.0)), _scene(medium=_medium(scattering=1e-9, anisotropy=0.0)),
-        {"resolution": 32}, equal=None,
+        {"resolution": 32},
     ),
     Skip(
         "zero-size bounce", "instant_multiple_scattering", "virtual lights of a bounce off black surfaces, surface layers",
