@@ -60,6 +60,16 @@ def load_scene(path: str | Path, *, overrides: Sequence[str] = ()) -> SceneFile:
     Raises ValueError, in one line, for whatever is wrong.
     """
     path = Path(path)
+    table = read_table(path, overrides=overrides)
+    try:
+        return make_scene(table, base=path.parent, name=path.stem)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_table(path: str | Path, *, overrides: Sequence[str] = ()) -> SceneTable:
+    """What a scene file says, as `load_scene` reads it, before any file that it names is read. Raises ValueError."""
+    path = Path(path)
     try:
         with path.open("rb") as file:
             table = tomllib.load(file)
@@ -70,7 +80,9 @@ def load_scene(path: str | Path, *, overrides: Sequence[str] = ()) -> SceneFile:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"{path} is no TOML file: {error}") from error
     try:
-        return make_scene(apply_overrides(table, overrides), base=path.parent, name=path.stem)
+        return SceneTable.model_validate(apply_overrides(table, overrides))
+    except ValidationError as error:
+        raise ValueError(f"{path}: {explain_error(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

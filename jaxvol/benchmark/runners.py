@@ -5,6 +5,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from jaxvol.benchmark.measure import Cost, First, first_call, measured
 from jaxvol.layers import from_items, items
 from jaxvol.methods import impulse_response
 from jaxvol.methods.impulse_response import baking, lightmap
-from jaxvol.scene import SceneFile, load_scene
+from jaxvol.scene import SceneFile, load_scene, read_table
 from jaxvol.scene_config import method_names
 from jaxvol.types import Estimate, Layers, Rays, Scene
 
@@ -39,10 +40,21 @@ class Run:
 
 
 def load_file(entry: SceneEntry, base: Path, *, overrides: tuple[str, ...] = ()) -> SceneFile:
-    """The scene of an entry at its size, with its overrides and more."""
-    size = (f"camera.width={entry.width}", f"camera.height={entry.height}")
-    file = load_scene(base / entry.file, overrides=[*size, *entry.overrides, *overrides])
+    """The scene of an entry at its size, with its overrides and more; those of [render] share one scene."""
+    path = base / entry.file
+    own = (f"camera.width={entry.width}", f"camera.height={entry.height}", *entry.overrides)
+    if not all(text.startswith("render.") for text in overrides):
+        file = load_scene(path, overrides=[*own, *overrides])
+    else:
+        file = _loaded(path, own, path.stat().st_mtime_ns if path.exists() else 0)
+        if overrides:
+            file = SceneFile(**{**vars(file), "render": read_table(path, overrides=[*own, *overrides]).render})
     return SceneFile(**{**vars(file), "name": scene_name(entry)})
+
+
+@lru_cache(maxsize=1)  # wanted two or three times for each setting, and smoke takes a second to make
+def _loaded(path: Path, overrides: tuple[str, ...], changed: int) -> SceneFile:
+    return load_scene(path, overrides=overrides)
 
 
 def as_overrides(method: str, settings: Settings) -> tuple[str, ...]:
