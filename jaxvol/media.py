@@ -53,8 +53,8 @@ def box_interval(
     bounds: Float[Array, "2 3"], origin: Float[Array, "*b 3"], direction: Float[Array, "*b 3"]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
     """(t0, t1) of a ray inside a box, t0 >= 0; a miss has t1 <= t0, both finite. Slab method, faces included."""
-    tiny = jnp.where(jnp.abs(direction) < 1e-20, jnp.where(direction < 0, -1e-20, 1e-20), direction)
-    inverse = 1.0 / tiny
+    least = 1e-18  # the square of its inverse, which slopes hold, stays within float32
+    inverse = 1.0 / jnp.where(jnp.abs(direction) < least, jnp.where(direction < 0, -least, least), direction)
     a = (bounds[0] - origin) * inverse
     b = (bounds[1] - origin) * inverse
     near = jnp.minimum(a, b)

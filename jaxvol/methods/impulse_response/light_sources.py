@@ -14,6 +14,7 @@ from jaxvol.sampling import dot
 from jaxvol.types import Scene
 
 DELTA = ("point", "spot", "directional")
+NEAREST = 1e-15  # the distance of an emitter from a point that lies on it
 
 
 class Light(eqx.Module):
@@ -71,7 +72,7 @@ def see(scene, position, normal, kind, index, u, *, scatters: bool) -> Light:
     if kind in ("point", "spot"):
         group = scene.point_lights if kind == "point" else scene.spot_lights
         delta = group.position[index] - position
-        distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
+        distance = jnp.sqrt(jnp.maximum(dot(delta, delta), NEAREST * NEAREST))
         direction = delta / distance[:, None]
         strength = group.intensity[index]
         if kind == "point":
@@ -97,7 +98,7 @@ def see(scene, position, normal, kind, index, u, *, scatters: bool) -> Light:
     a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
     w1, w2 = sampling.sample_triangle(u[0], u[1])
     delta = a + w1[:, None] * (b - a) + w2[:, None] * (c - a) - position
-    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), NEAREST * NEAREST))
     emission = mesh.emission[face]
     density = lights.luminance(emission) / group.total  # 1/area
     normal = sampling.normalize(jnp.cross(b - a, c - a))
@@ -110,7 +111,7 @@ def see_again(scene, position, kind, index, light: Light, moved) -> Light:
     if light.infinite:
         return light
     delta = position + light.distance[:, None] * light.direction - moved
-    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-30))
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), NEAREST * NEAREST))
     direction = delta / distance[:, None]
     strength = light.strength
     if kind == "spot":

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 from jaxvol import extinction, harmonics, media, phase, sampling, zonal_lookup
 from jaxvol.methods.impulse_response import lookup, shading
 from jaxvol.methods.impulse_response.emitters import EXTRAPOLATION, slab_share
-from jaxvol.methods.impulse_response.light_sources import Light
+from jaxvol.methods.impulse_response.light_sources import NEAREST, Light
 from jaxvol.sampling import dot
 
 # Shares of places by half angles or in a spot's cone, and equi-angular along rays; the rest by free flight. Onward legs want
@@ -258,7 +258,9 @@ def scattered_once(
     if light.normal is not None:
         source = source * jnp.maximum(-dot(light.normal, light.direction), 0.0)[:, None]
     if not light.infinite:
-        source = source / (light.distance * light.distance)[:, None]
+        apart = light.distance > 2 * NEAREST  # on the lamp itself, which rounding hits, nothing is counted
+        near = jnp.where(apart, 1 / jnp.where(apart, light.distance, 1.0), 0.0)
+        source = source * (near * near)[:, None]
     # Directions toward light: it travels along -light.direction, then along -outward.
     return jnp.where(lit[:, None], source * jnp.exp(-far), 0.0) * phase.evaluate(medium, dot(outward, light.direction))[:, None]
 

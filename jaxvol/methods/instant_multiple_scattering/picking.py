@@ -91,7 +91,10 @@ def _pick(estimate, lights, u, num_groups, num_payload):
 
         (kept, late), _ = lax.scan(member, (empty, nothing), (members, indices, shifts))
         kept = _offer(kept, *late)
-        scale = jnp.where(kept.total > 0, kept.total / jnp.maximum(kept.estimate, 1e-37), 0.0)
+        # In units of the estimate: its square, which the slope of a quotient divides by, is not within float32.
+        unit = lax.stop_gradient(jnp.where(kept.estimate > 0, kept.estimate, 1.0))
+        share = jnp.where(kept.estimate > 0, kept.estimate / unit, 1.0)
+        scale = jnp.where(kept.estimate > 0, kept.total / unit / share, 0.0)
         return None, (kept.light, scale, *kept.payload)
 
     starts = gathering.golden(7919 * jnp.arange(num_groups) + 1)
@@ -121,7 +124,7 @@ def pick_for_segments(
     number = 0 if segments.column is None else segments.column.shape[0]
     if number:
         ends = jnp.pad(segments.column, ((1, 0), (0, 0)))
-        length = jnp.maximum(segments.t1 - segments.t0, 1e-30)
+        length = jnp.where(segments.t1 > segments.t0, segments.t1 - segments.t0, 1.0)
         density = (ends[1:] - ends[:-1]) * (number / length)
         # A step beside one that holds density is not empty: the table blurs over a step.
         padded = jnp.pad(density, ((1, 1), (0, 0)), mode="edge")

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxvol import materials, media, ray_casting, sampling
 from jaxvol.types import Medium, Mesh, Scene
 
+_LEAST = 1e-18  # of denominators: the square of its inverse, which their slopes hold, stays within float32
 
 class Segments(eqx.Module):
     """Pieces of eye rays inside the medium; t0 >= t1 where a ray misses it. Directions point away from the eye."""
@@ -101,7 +102,7 @@ def column_at(segments: Segments, t: Float[Array, "*k n"]) -> Float[Array, "*k n
 def _step_of(segments, t):
     """Step of the table that holds t, and the position in it."""
     number = segments.column.shape[0]
-    length = jnp.maximum(segments.t1 - segments.t0, 1e-30)
+    length = jnp.maximum(segments.t1 - segments.t0, _LEAST)
     x = jnp.clip((t - segments.t0) / length, 0.0, 1.0) * number
     step = jnp.minimum(x.astype(jnp.int32), number - 1)
     return step, jnp.clip(x - step, 0.0, 1.0)
@@ -119,16 +120,16 @@ def sample_transmittance(
     if segments.column is None:
         offset = sampling.sample_truncated_exponential(u, sigma, length)
         pdf = sampling.sample_truncated_exponential_pdf(offset, sigma, length)
-        return segments.t0 + offset, jnp.where(length > 0, 1.0 / jnp.maximum(pdf, 1e-30), 0.0)
+        return segments.t0 + offset, jnp.where(length > 0, 1.0 / jnp.maximum(pdf, _LEAST), 0.0)
     total = segments.column[-1]
     column = sampling.sample_truncated_exponential(u, sigma, total)
-    inverse = 1.0 / jnp.maximum(sampling.sample_truncated_exponential_pdf(column, sigma, total), 1e-30)
+    inverse = 1.0 / jnp.maximum(sampling.sample_truncated_exponential_pdf(column, sigma, total), _LEAST)
     number = segments.column.shape[0]
     step = jnp.minimum(jnp.sum(segments.column < column, axis=0), number - 1)
     lanes = jnp.arange(total.shape[0])
     after = segments.column[step, lanes]
     before = jnp.where(step > 0, segments.column[jnp.maximum(step - 1, 0), lanes], 0.0)
-    fraction = (column - before) / jnp.maximum(after - before, 1e-30)
+    fraction = (column - before) / jnp.maximum(after - before, _LEAST)
     t = segments.t0 + (step + jnp.clip(fraction, 0.0, 1.0)) * (length / number)
     return t, jnp.where(total > 0, inverse, 0.0)
 
@@ -154,7 +155,7 @@ def sample_transmittance_or_light(
     pdf = sampling.sample_equiangular_pdf(chosen, *ray)
     density, by_column, filled = _density_and_pdf(segments, chosen, sigma)
     # Not by way of 1 / pdf, which is inf where a light is behind an optical thickness of hundreds, with a slope of NaN.
-    mixed = density / jnp.where(filled, jnp.maximum(0.5 * density * by_column + 0.5 * pdf, 1e-30), 1.0)
+    mixed = density / jnp.where(filled, jnp.maximum(0.5 * density * by_column + 0.5 * pdf, _LEAST), 1.0)
     return chosen, jnp.where(near, jnp.where(filled, mixed, 0.0), w)
 
 
@@ -169,7 +170,7 @@ def _density_and_pdf(segments, t, sigma):
     step, _ = _step_of(segments, t)
     lanes = jnp.arange(total.shape[0])
     before = jnp.where(step > 0, segments.column[jnp.maximum(step - 1, 0), lanes], 0.0)
-    length = jnp.maximum(segments.t1 - segments.t0, 1e-30)
+    length = jnp.maximum(segments.t1 - segments.t0, _LEAST)
     density = (segments.column[step, lanes] - before) * (segments.column.shape[0] / length)
     return density, pdf, total > 0
 
