@@ -110,7 +110,10 @@ def emit(scene: Scene, path: UInt[Array, "n"], seed: UInt[Array, ""]) -> Walkers
 
 
 def _channel_probabilities(walkers):
-    return walkers.power / jnp.maximum(jnp.sum(walkers.power, axis=-1, keepdims=True), 1e-30)
+    # In units of the largest: the square of a small sum, which the slope of a quotient divides by, underflows.
+    largest = lax.stop_gradient(jnp.max(walkers.power, axis=-1, keepdims=True))
+    share = walkers.power / jnp.where(largest > 0, largest, 1.0)
+    return share / jnp.where(largest > 0, jnp.sum(share, axis=-1, keepdims=True), 1.0)
 
 
 def _channel(choice, u):
@@ -158,10 +161,11 @@ def _tentative(medium, walkers, tracking, t1, flying, seed):
     rho = media.density(medium, walkers.origin + t[:, None] * walkers.direction)
     real = flying & (v[1] * rate < rho * sigma)
     kept = tracking.survival * (1.0 - rho[:, None] * extinction / jnp.maximum(rate, 1e-30))
-    kept = kept / jnp.maximum(jnp.max(kept, axis=-1, keepdims=True), 1e-30)
+    most = jnp.max(kept, axis=-1, keepdims=True)
+    kept = kept / jnp.where(most > 0, most, 1.0)
     survival = jnp.where((flying & ~real)[:, None], kept, tracking.survival)
     pdf = sampling.dot(choice, survival * jnp.where(real[:, None], rho[:, None] * extinction, 1.0))
-    weight = survival / jnp.maximum(pdf, 1e-30)[:, None]
+    weight = survival / jnp.where(pdf > 0, pdf, 1.0)[:, None]
     return Tracking(t, tracking.event + 1, survival), flying, real, weight, rho
 
 
@@ -204,13 +208,15 @@ def _interact(scene, walkers, flight, meets, hit, face, u):
         pdf = materials.sample_pdf(surface, hit.normal, walkers.direction, reflected)
         value = materials.evaluate(surface, hit.normal, walkers.direction, reflected)
         cosine = jnp.abs(sampling.dot(hit.normal, reflected))
-        gain = value * (cosine / jnp.maximum(pdf, 1e-20))[:, None]
+        gain = value * (cosine / jnp.maximum(pdf, 1e-18))[:, None]
         direction = jnp.where(meets[:, None], reflected, direction)
         power = jnp.where(meets[:, None], incident * gain, power)
         lifted = ray_casting.offset_origin(position, hit.normal, direction, scale=ray_casting.scene_scale(scene.mesh))
         origin = jnp.where(meets[:, None], lifted, position)
     interacts = walkers.alive & (flight.scatters | meets)
-    kept = jnp.max(power, axis=-1) / jnp.maximum(jnp.max(walkers.power, axis=-1), 1e-30)
+    before = jnp.max(walkers.power, axis=-1)
+    unit = lax.stop_gradient(jnp.where(before > 0, before, 1.0))
+    kept = jnp.max(power, axis=-1) / unit / jnp.where(before > 0, before / unit, 1.0)
     survival = jnp.minimum(kept, 1.0)
     alive = interacts & (u[5] < survival)
     power = jnp.where(alive[:, None], power / jnp.maximum(survival, 1e-30)[:, None], 0.0)
