@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxvol import lights
+from jaxvol import lights, slopes
 from jaxvol.lights import LightSample
 from jaxvol.sampling import dot, normalize
 from jaxvol.types import Scene
@@ -140,16 +140,11 @@ def _arvo(to_corners, area, u1, u2):
     numerator = (v * t - u * s) * cos_alpha - v
     denominator = (v * s + u * t) * sin_alpha
     q = jnp.clip(numerator / jnp.where(jnp.abs(denominator) > 1e-30, denominator, 1e-30), -1.0, 1.0)
-    third = q[..., None] * a + _root((1.0 - q) * (1.0 + q))[..., None] * _orthogonal(c, a)
+    third = q[..., None] * a + slopes.root((1.0 - q) * (1.0 + q))[..., None] * _orthogonal(c, a)
     away = third - b
     one_minus_z = u2 * 0.5 * dot(away, away)  # 1 - z = u2 (1 - third . b)
-    sin_z = _root(one_minus_z * (2.0 - one_minus_z))
+    sin_z = slopes.root(one_minus_z * (2.0 - one_minus_z))
     return normalize((1.0 - one_minus_z)[..., None] * b + sin_z[..., None] * _orthogonal(third, b))
-
-
-def _root(x):
-    """sqrt(max(x, 0)), with slope 0 at 0."""
-    return jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0)
 
 
 def _orthogonal(x, y):

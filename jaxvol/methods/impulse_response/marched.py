@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxvol import extinction, harmonics, media, phase, sampling, zonal_lookup
+from jaxvol import extinction, harmonics, media, phase, sampling, slopes, zonal_lookup
 from jaxvol.methods.impulse_response import lookup, shading
 from jaxvol.methods.impulse_response.emitters import EXTRAPOLATION, slab_share
 from jaxvol.methods.impulse_response.light_sources import NEAREST, Light
@@ -237,9 +237,7 @@ def survive(
     weight: Float[Array, "n 3"], first: Float[Array, "n 3"], free: Bool[Array, "n"], u: Float[Array, "n"], *, gain: float = 16.0
 ) -> Float[Array, "n 3"]:
     """Throughputs after Russian roulette on a `gain`th of a walk's first one; 0 where it lost or the way is not free."""
-    before = jnp.max(first, axis=-1)
-    unit = lax.stop_gradient(jnp.where(before > 0, before, 1.0))  # the square of a small weight, in slopes, underflows
-    chance = jnp.minimum(gain * jnp.max(weight, axis=-1) / unit / jnp.where(before > 0, before / unit, 1.0), 1.0)
+    chance = jnp.minimum(gain * slopes.ratio(jnp.max(weight, axis=-1), jnp.max(first, axis=-1)), 1.0)
     kept = jnp.where(free & (u < chance), 1 / jnp.maximum(chance, 1e-30), 0.0)
     return weight * kept[:, None]
 

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt
 
-from jaxvol import emission, materials, media, phase, ray_casting, sampling
+from jaxvol import emission, materials, media, phase, ray_casting, sampling, slopes
 from jaxvol.types import Scene
 
 _EMISSION = sampling.stream("instant_multiple_scattering.emission")
@@ -110,10 +110,7 @@ def emit(scene: Scene, path: UInt[Array, "n"], seed: UInt[Array, ""]) -> Walkers
 
 
 def _channel_probabilities(walkers):
-    # In units of the largest: the square of a small sum, which the slope of a quotient divides by, underflows.
-    largest = lax.stop_gradient(jnp.max(walkers.power, axis=-1, keepdims=True))
-    share = walkers.power / jnp.where(largest > 0, largest, 1.0)
-    return share / jnp.where(largest > 0, jnp.sum(share, axis=-1, keepdims=True), 1.0)
+    return slopes.ratio(walkers.power, jnp.sum(walkers.power, axis=-1, keepdims=True))
 
 
 def _channel(choice, u):
@@ -214,9 +211,7 @@ def _interact(scene, walkers, flight, meets, hit, face, u):
         lifted = ray_casting.offset_origin(position, hit.normal, direction, scale=ray_casting.scene_scale(scene.mesh))
         origin = jnp.where(meets[:, None], lifted, position)
     interacts = walkers.alive & (flight.scatters | meets)
-    before = jnp.max(walkers.power, axis=-1)
-    unit = lax.stop_gradient(jnp.where(before > 0, before, 1.0))
-    kept = jnp.max(power, axis=-1) / unit / jnp.where(before > 0, before / unit, 1.0)
+    kept = slopes.ratio(jnp.max(power, axis=-1), jnp.max(walkers.power, axis=-1))
     survival = jnp.minimum(kept, 1.0)
     alive = interacts & (u[5] < survival)
     power = jnp.where(alive[:, None], power / jnp.maximum(survival, 1e-30)[:, None], 0.0)

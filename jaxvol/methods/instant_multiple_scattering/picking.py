@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxvol import media
+from jaxvol import media, slopes
 from jaxvol.methods.instant_multiple_scattering import gathering, pairs, receivers
 from jaxvol.methods.instant_multiple_scattering.gathering import Light
 from jaxvol.methods.instant_multiple_scattering.receivers import Points, Segments
@@ -91,10 +91,7 @@ def _pick(estimate, lights, u, num_groups, num_payload):
 
         (kept, late), _ = lax.scan(member, (empty, nothing), (members, indices, shifts))
         kept = _offer(kept, *late)
-        # In units of the estimate: its square, which the slope of a quotient divides by, is not within float32.
-        unit = lax.stop_gradient(jnp.where(kept.estimate > 0, kept.estimate, 1.0))
-        share = jnp.where(kept.estimate > 0, kept.estimate / unit, 1.0)
-        scale = jnp.where(kept.estimate > 0, kept.total / unit / share, 0.0)
+        scale = slopes.ratio(kept.total, kept.estimate)
         return None, (kept.light, scale, *kept.payload)
 
     starts = gathering.golden(7919 * jnp.arange(num_groups) + 1)

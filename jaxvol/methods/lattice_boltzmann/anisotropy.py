@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxvol import slopes
 from jaxvol.methods.lattice_boltzmann import preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import Lattice, ProbabilityMap, beta_gamma, link_class, link_length
@@ -208,5 +209,4 @@ def solve(
 
 def _norm(x):
     """Length of x, with slope 0 where all is 0."""
-    squared = jnp.sum(x * x)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    return slopes.root(jnp.sum(x * x))

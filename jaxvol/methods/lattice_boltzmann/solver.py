@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxvol import slopes
 from jaxvol.methods.lattice_boltzmann import preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import ConjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import Coefficients, Lattice
@@ -54,7 +55,7 @@ def solve(
         return plain(coefficients, deposit, tolerance, levels)
 
     @solved.defjvp
-    def slopes(primals, tangents):
+    def along(primals, tangents):
         k, dk = primals[0].scattering, tangents[0].scattering
         sent = jnp.where(k > 0, 0.0, dk * solved(*primals).phi)
         solving = partial(plain, tolerance=primals[2], levels=primals[3])
@@ -65,7 +66,7 @@ def solve(
 
 
 def _solve(lattice, coefficients, deposit, tolerance, max_steps, levels):
-    root = _safe_sqrt(coefficients.scattering)
+    root = slopes.root(coefficients.scattering)
     phi_first = transport(lattice, coefficients, deposit)
     right = root * phi_first
     size = jnp.sqrt(jnp.sum(right * right))
@@ -100,8 +101,3 @@ def _solve(lattice, coefficients, deposit, tolerance, max_steps, levels):
         residual=residual,
         converged=residual <= 2.0 * tolerance,
     )
-
-
-def _safe_sqrt(k):
-    positive = k > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, k, 1.0)), 0.0)

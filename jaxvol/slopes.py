@@ -1,0 +1,18 @@
+"""Roots and quotients whose slopes are finite where those of the plain operations are not."""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+
+def root(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """sqrt(max(x, 0)), with slope 0 where that is 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def ratio(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """a / b for b > 0, else 0; in units of b, as the square of a small b, by which the slope is divided, underflows."""
+    positive = b > 0
+    unit = lax.stop_gradient(jnp.where(positive, b, 1.0))
+    return jnp.where(positive, a / unit / jnp.where(positive, b / unit, 1.0), 0.0)
