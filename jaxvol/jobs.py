@@ -25,7 +25,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 MANIFEST = "manifest.json"
 _PART_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=,-]{0,150}")
-_PART_FILE = re.compile(r"(?P<name>.+)-[0-9a-f]{16}\.npz")
+_PART_FILE = re.compile(r".+-[0-9a-f]{16}\.npz")
+_TEMPORARY_FILE = re.compile(r"\..{1,100}-[0-9a-f]{12}\.(npz|json)")  # as `atomic_write` names them; a killed job leaves one
 
 
 @contextmanager
@@ -194,8 +195,8 @@ class Parts:
 
     def _remove_unlisted(self) -> None:
         listed = {self._file(name, digest).name for name, digest in self._digests.items()}
-        for file in self.folder.glob("*.npz"):
-            if file.name not in listed and _PART_FILE.fullmatch(file.name):
+        for file in list(self.folder.glob("*")):
+            if _TEMPORARY_FILE.fullmatch(file.name) or (file.name not in listed and _PART_FILE.fullmatch(file.name)):
                 file.unlink(missing_ok=True)
 
 

@@ -126,6 +126,23 @@ def test_an_accumulator_may_be_overwritten_and_interrupted(folder, monkeypatch):
     assert_same(jobs.Parts(folder, config=CONFIG).get("sum"), part(2))
 
 
+def test_what_a_killed_job_was_writing_goes_with_the_rest(folder, monkeypatch):
+    parts = jobs.Parts(folder, config=CONFIG)
+    parts.put("a", part(0))
+    written = []
+    monkeypatch.setattr(jobs.os, "replace", lambda temporary, target: written.append((temporary, temporary.read_bytes())))
+    parts.put("b" * 140, part(1))  # a part and the manifest
+    monkeypatch.undo()
+    for temporary, data in written:
+        temporary.write_bytes(data)  # a killed process does not come to delete it
+    (folder / "notes-of-the-user.npz").touch()
+    assert {file.suffix for file, _ in written} == {".npz", ".json"} and len(list(folder.iterdir())) == 5
+    again = jobs.Parts(folder, config=CONFIG)
+    assert again.names == ("a",) and len(list(folder.iterdir())) == 3
+    again.clear()
+    assert [file.name for file in folder.iterdir()] == ["notes-of-the-user.npz"]
+
+
 @pytest.mark.parametrize("harm", ["truncate", "edit", "empty", "delete", "swap"])
 def test_a_damaged_part_is_found_and_computed_again(harm, folder):
     parts = jobs.Parts(folder, config=CONFIG)

@@ -84,7 +84,8 @@ path_tracing.render(scene, camera, plan, samples=4000, seed=2, parts=Parts(sys.a
 def test_a_killed_job_resumes_to_the_same_picture(root, tmp_path):
     """SIGKILL in the middle of a batch: what was saved before is whole, and the rest is the rest."""
     child = subprocess.Popen([sys.executable, "-c", _CHILD, tmp_path / "parts"], cwd=root)
-    while child.poll() is None and not list((tmp_path / "parts").glob("accumulator-*.npz")):
+    manifest = tmp_path / "parts" / "manifest.json"
+    while child.poll() is None and not (manifest.exists() and "accumulator" in manifest.read_text()):
         time.sleep(0.05)
     time.sleep(0.5)
     child.kill()
