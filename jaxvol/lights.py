@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from jaxvol import slopes
 from jaxvol.sampling import (
     dot,
     normalize,
@@ -38,7 +39,7 @@ class LightSample(eqx.Module):
 def luminance(rgb: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
     """Rec. 709 luminance, floored at a little of the strongest channel so that pure colours still get samples."""
     y = _LUMINANCE[0] * rgb[..., 0] + _LUMINANCE[1] * rgb[..., 1] + _LUMINANCE[2] * rgb[..., 2]
-    return jnp.maximum(y, 0.1 * jnp.max(rgb, axis=-1))
+    return jnp.maximum(y, 0.1 * slopes.largest(rgb))
 
 
 def _luminance_host(rgb):

@@ -1,4 +1,6 @@
-"""Roots and quotients whose slopes are finite where those of the plain operations are not."""
+"""Roots, quotients and maxima whose slopes are finite where those of the plain operations are not."""
+
+import functools
 
 import jax.numpy as jnp
 from jax import lax
@@ -16,3 +18,13 @@ def ratio(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
     positive = b > 0
     unit = lax.stop_gradient(jnp.where(positive, b, 1.0))
     return jnp.where(positive, a / unit / jnp.where(positive, b / unit, 1.0), 0.0)
+
+
+def largest(x: Float[Array, "*b n"]) -> Float[Array, "*b"]:
+    """The largest entry of the last axis, a short one, with that entry's slope.
+
+    The slope of jnp.max is a mean over the entries that equal the maximum: 0 / 0 where a compiled program computes `x`
+    twice, once for the maximum and once to compare, and contracts products and sums in one of them only.
+    """
+    parts = (x[..., i] for i in range(x.shape[-1]))
+    return functools.reduce(lambda a, b: jnp.where(a > b, a, b), parts)

@@ -1,4 +1,4 @@
-"""Slopes where those of plain roots and quotients are not finite."""
+"""Slopes where those of plain roots, quotients and maxima are not finite."""
 
 import jax
 import jax.numpy as jnp
@@ -20,3 +20,13 @@ def test_quotients_of_small_numbers_have_slopes():
     value, slope = jax.jvp(slopes.ratio, (a, b), (a, 0.5 * b))
     np.testing.assert_allclose(value, [2.0, 2.0, 0.0], rtol=1e-6)
     np.testing.assert_allclose(slope, [1.0, 1.0, 0.0], rtol=1e-6)
+
+
+def test_the_largest_entry_has_its_own_slope():
+    """Without a comparison for equality, which rounding breaks; among equals one of theirs."""
+    x = jnp.array([[1.0, 3.0, 2.0], [-1.0, -2.0, -1.0], [0.0, 0.0, 5.0]])
+    t = jnp.arange(9.0).reshape(3, 3)
+    value, slope = jax.jvp(slopes.largest, (x,), (t,))
+    np.testing.assert_array_equal(value, [3.0, -1.0, 5.0])
+    assert slope[0] == 1.0 and slope[1] in (3.0, 5.0) and slope[2] == 8.0
+    assert " eq " not in str(jax.make_jaxpr(lambda x, t: jax.jvp(slopes.largest, (x,), (t,)))(x, t))

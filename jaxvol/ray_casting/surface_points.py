@@ -1,8 +1,10 @@
 """From hits to points on surfaces, and from points on surfaces to origins of new rays."""
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxvol import slopes
 from jaxvol.types import Hits, Mesh
 
 _OFFSET = 2.0**-16  # relative to the size of the coordinates: 128 float32 roundings
@@ -56,7 +58,7 @@ def offset_origin(
     By 2^-16 times the largest of the point's coordinates and `scale`, which stands for the size of the scene's
     triangles and so of their rounding errors; pass `scene_scale(mesh)` for scenes far from unit size.
     """
-    size = jnp.maximum(jnp.max(jnp.abs(position), -1, keepdims=True), scale)
+    size = jnp.maximum(slopes.largest(jnp.abs(position))[..., None], scale)
     side = jnp.where(jnp.sum(normal * direction, -1, keepdims=True) >= 0.0, 1.0, -1.0)
     return position + _OFFSET * size * side * normal
 
@@ -68,6 +70,6 @@ def scene_scale(mesh: Mesh) -> Float[Array, ""]:
 
 def _unit(vector):
     """Normalised; (0, 0, 1) where the length is zero. Safe for gradients and for tiny triangles."""
-    size = jnp.max(jnp.abs(vector), -1, keepdims=True)
+    size = lax.stop_gradient(jnp.max(jnp.abs(vector), -1, keepdims=True))  # as the unit
     vector = jnp.where(size > 0.0, vector / jnp.where(size > 0.0, size, 1.0), jnp.array([0.0, 0.0, 1.0]))
     return vector / jnp.sqrt(jnp.sum(vector * vector, -1, keepdims=True))

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from jaxvol import sampling
+from jaxvol import sampling, slopes
 from jaxvol.methods.impulse_response import emitters, final_gather, light_sources, steps, walks
 from jaxvol.methods.impulse_response.kit import Kit, Tally, occluded, thickness
 from jaxvol.methods.impulse_response.light_sources import DELTA, delta_lights
@@ -202,5 +202,5 @@ def _count_alive(first_step, rest):
 def _survive(first_step, rest, item, sample, seed, depth):
     """Russian roulette from the third vertex on; paths that lost end with weight 0."""
     u = sampling.uniforms(seed, _STREAM, item, 1000 + depth, sample)[0]
-    chance = jnp.clip(jnp.max(jnp.abs(first_row(first_step[0] + first_step[1]) * rest), axis=-1), 0.1, 1.0)
+    chance = jnp.clip(slopes.largest(jnp.abs(first_row(first_step[0] + first_step[1]) * rest)), 0.1, 1.0)
     return rest * jnp.where(u < chance, 1 / chance, 0.0)[:, None]

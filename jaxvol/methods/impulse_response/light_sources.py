@@ -51,7 +51,7 @@ def choose(scene, position, kind, u, *, falloff: int) -> tuple[Int[Array, "n"], 
         square = dot(delta, delta)
         square = jnp.where(square < 1e30, square, 1e30)  # paths that have left the scene are nowhere
         near = lax.integer_pow(lax.rsqrt(jnp.maximum(square, 1e-30)), falloff)
-        near = near / jnp.max(near, axis=-1, keepdims=True)
+        near = near / lax.stop_gradient(jnp.max(near, axis=-1, keepdims=True))  # as the unit
         chance = 0.75 * _shares(strength * near) + 0.25 * _shares(strength)
     total = jnp.cumsum(chance, axis=-1)
     index = jnp.minimum(jnp.sum(u[:, None] * total[:, -1:] >= total, axis=-1), chance.shape[1] - 1)

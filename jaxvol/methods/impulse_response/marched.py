@@ -237,7 +237,7 @@ def survive(
     weight: Float[Array, "n 3"], first: Float[Array, "n 3"], free: Bool[Array, "n"], u: Float[Array, "n"], *, gain: float = 16.0
 ) -> Float[Array, "n 3"]:
     """Throughputs after Russian roulette on a `gain`th of a walk's first one; 0 where it lost or the way is not free."""
-    chance = jnp.minimum(gain * slopes.ratio(jnp.max(weight, axis=-1), jnp.max(first, axis=-1)), 1.0)
+    chance = jnp.minimum(gain * slopes.ratio(slopes.largest(weight), slopes.largest(first)), 1.0)
     kept = jnp.where(free & (u < chance), 1 / jnp.maximum(chance, 1e-30), 0.0)
     return weight * kept[:, None]
 

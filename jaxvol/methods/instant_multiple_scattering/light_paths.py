@@ -158,7 +158,7 @@ def _tentative(medium, walkers, tracking, t1, flying, seed):
     rho = media.density(medium, walkers.origin + t[:, None] * walkers.direction)
     real = flying & (v[1] * rate < rho * sigma)
     kept = tracking.survival * (1.0 - rho[:, None] * extinction / jnp.maximum(rate, 1e-30))
-    most = jnp.max(kept, axis=-1, keepdims=True)
+    most = slopes.largest(kept)[:, None]
     kept = kept / jnp.where(most > 0, most, 1.0)
     survival = jnp.where((flying & ~real)[:, None], kept, tracking.survival)
     pdf = sampling.dot(choice, survival * jnp.where(real[:, None], rho[:, None] * extinction, 1.0))
@@ -211,7 +211,7 @@ def _interact(scene, walkers, flight, meets, hit, face, u):
         lifted = ray_casting.offset_origin(position, hit.normal, direction, scale=ray_casting.scene_scale(scene.mesh))
         origin = jnp.where(meets[:, None], lifted, position)
     interacts = walkers.alive & (flight.scatters | meets)
-    kept = slopes.ratio(jnp.max(power, axis=-1), jnp.max(walkers.power, axis=-1))
+    kept = slopes.ratio(slopes.largest(power), slopes.largest(walkers.power))
     survival = jnp.minimum(kept, 1.0)
     alive = interacts & (u[5] < survival)
     power = jnp.where(alive[:, None], power / jnp.maximum(survival, 1e-30)[:, None], 0.0)

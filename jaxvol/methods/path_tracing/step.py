@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt
 
-from jaxvol import lights, materials, ray_casting, sampling
+from jaxvol import lights, materials, ray_casting, sampling, slopes
 from jaxvol.methods.path_tracing import flight as flights
 from jaxvol.methods.path_tracing import sensors
 from jaxvol.methods.path_tracing.connect import connect, connect_equiangular, equiangular_density, flown_segment
@@ -226,7 +226,7 @@ def _event(scene, proxy, sensor, settings, seed, lanes, casts, ready):
 
     direction, weight, pdf = _scatter(scene, lanes, arrival, surface, scatter_u)
     scattered = throughput * weight
-    keep = jnp.max(scattered, axis=-1)
+    keep = slopes.largest(scattered)
     survival = jnp.where(count >= settings.roulette_from, jnp.clip(keep, 0.02, 1.0), 1.0)
     alive = vertex & (scatter_u[3] < survival) & (keep > 0)
     if scene.area_lights is None and scene.environment is None:

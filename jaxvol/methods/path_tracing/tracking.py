@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 
-from jaxvol import sampling
+from jaxvol import sampling, slopes
 from jaxvol.methods.path_tracing import flight as flights
 from jaxvol.methods.path_tracing.lanes import ARRIVED, ON_APPROACH, ON_PATH, ON_SECOND_SHADOW, ON_SHADOW
 
@@ -117,7 +117,7 @@ def track(scene, settings, seed, lanes, casts):
         survive = jnp.where(connecting, 1.0, jnp.maximum(1.0 - hero_share, 1e-6))
         passed = ratio * (1.0 - share) / survive[:, None]
         struck = ratio * share / jnp.maximum(hero_share, 1e-30)[:, None]
-        weight = jnp.max(passed, axis=-1)
+        weight = slopes.largest(passed)
         gamble = connecting & (weight < _ROULETTE)
         lost = gamble & (v * _ROULETTE >= weight)
         raised = passed * (_ROULETTE / jnp.maximum(weight, 1e-30))[:, None]
