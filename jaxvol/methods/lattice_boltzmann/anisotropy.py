@@ -27,7 +27,7 @@ from jaxvol.methods.lattice_boltzmann import preconditioner
 from jaxvol.methods.lattice_boltzmann.krylov import BiconjugateGradients
 from jaxvol.methods.lattice_boltzmann.lattice import Lattice, ProbabilityMap, beta_gamma, link_class, link_length
 from jaxvol.methods.lattice_boltzmann.materials import forward_part
-from jaxvol.methods.lattice_boltzmann.sweeps import move_plane
+from jaxvol.methods.lattice_boltzmann.sweeps import both_senses, move_plane, one_grid
 
 _DARK = 1e-18  # of the light that is marched, which is about 1; its square is a normal number
 
@@ -99,22 +99,25 @@ def transport(
         steps = [c for c in lattice.directions if c[axis] == 1 and not any(c[a] for a in range(axis))]
         if not steps:
             continue
-        moved = jnp.transpose(extinction, along), jnp.transpose(sources, (0, *(1 + a for a in along)))
-        back = (0, *(1 + int(k) for k in np.argsort(along)))
-        for sense in (1, -1):
-            found = _scan(lattice, *moved, steps, along, sense, degree, kind)
-            total = total + jnp.transpose(found, back)
+        signs = mirror_signs((axis,), degree)
+        planes = both_senses(extinction[None], along)[:, :, 0], both_senses(sources, along, signs)
+        total = total + one_grid(_scan(lattice, *planes, steps, along, degree, kind), along, signs)
     return total
 
 
-def _scan(lattice, extinction, sources, steps, along, sense, degree, kind):
+def mirror_signs(axes: tuple[int, ...], degree: int) -> np.ndarray:
+    """[n] what moments are multiplied by when the grid is mirrored along the axes."""
+    place = np.array([0.48, 0.6, 0.64])  # no harmonic is 0 there
+    mirrored = np.where(np.isin(np.arange(3), axes), -place, place)
+    return np.sign(np.array(basis(*mirrored, degree)) / np.array(basis(*place, degree)))
+
+
+def _scan(lattice, extinction, sources, steps, along, degree, kind):
+    """Moments [planes, 2, n, rows, columns] of the light of sources of that shape."""
     classes = sorted({link_class(c) for c in steps})
     headings = []
     for c in steps:
-        vector = np.array(c, float)
-        vector[along[0]] *= sense
-        unit = vector / np.linalg.norm(vector)
-        values = [float(v) for v in basis(*unit, degree)]
+        values = [float(v) for v in basis(*(np.array(c) / np.linalg.norm(c)), degree)]
         headings.append((link_class(c), c[along[1]], c[along[2]], values))
 
     def body(arrivals, planes):
@@ -123,18 +126,17 @@ def _scan(lattice, extinction, sources, steps, along, sense, degree, kind):
         for cls in classes:
             beta, gamma = beta_gamma(sigma * link_length(cls), kind)
             link[cls] = beta, gamma, 1.0 - sigma * link_length(cls) * beta
-        gathered, leaving = [jnp.zeros_like(sigma)] * source.shape[0], []
+        gathered, leaving = [jnp.zeros_like(sigma)] * source.shape[1], []
         for f, (cls, row, column, values) in zip(arrivals, headings, strict=True):
             beta, gamma, passing = link[cls]
-            emitted = lattice.weight(cls) * sum(v * source[n] for n, v in enumerate(values) if abs(v) > 1e-6)
+            emitted = lattice.weight(cls) * sum(v * source[:, n] for n, v in enumerate(values) if abs(v) > 1e-6)
             mean = link_length(cls) * (beta * f + gamma * emitted)
             gathered = [t + v * mean if abs(v) > 1e-6 else t for t, v in zip(gathered, values, strict=True)]
             leaving.append(move_plane(passing * f + beta * emitted, row, column))
-        return tuple(leaving), jnp.stack(gathered)
+        return tuple(leaving), jnp.stack(gathered, axis=1)
 
-    start = tuple(jnp.zeros(extinction.shape[1:], sources.dtype) for _ in steps)
-    found = lax.scan(body, start, (extinction, jnp.moveaxis(sources, 0, 1)), reverse=sense < 0)[1]
-    return jnp.moveaxis(found, 1, 0)
+    start = tuple(jnp.zeros((2, *sources.shape[3:]), sources.dtype) for _ in steps)
+    return lax.scan(body, start, (extinction, sources))[1]
 
 
 def first_collisions(
@@ -202,9 +204,9 @@ def solve(
         options={"preconditioner": lx.FunctionLinearOperator(precondition, structure)},
         throw=False,
     )
-    moments = right + apply(strength * (answer.value * size))
-    residual = lax.stop_gradient(_norm(unit + apply(strength * answer.value) - answer.value))
-    return Moments(moments, 2 * answer.stats["num_steps"] + 2, residual, residual <= 3.0 * tolerance)
+    image = apply(strength * answer.value)
+    residual = lax.stop_gradient(_norm(unit + image - answer.value))
+    return Moments(right + size * image, 2 * answer.stats["num_steps"] + 2, residual, residual <= 3.0 * tolerance)
 
 
 def _norm(x):

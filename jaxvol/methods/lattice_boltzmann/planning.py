@@ -37,7 +37,7 @@ class Plan:
     samples_per_pixel: int
     tolerance: float  # relative residual of the lattice
     max_applications: int
-    corrections: int  # of the lattice's angular error by sweeps along 80 directions
+    corrections: int  # of the lattice's angular error by sweeps along 72 directions
     solve: bool  # False: nothing scatters, the lattice stays dark
     preconditioned: bool
     homogeneous: bool  # one sigma in every voxel: the lattice's coefficients are numbers

@@ -123,7 +123,7 @@ def test_reflectance_of_a_slab_that_scatters_forwards():
 
 
 def test_corrections_along_many_directions_agree_where_nothing_is_left_to_correct():
-    """Moments by 80 directions against 26 for a source that fills a cube: equal to 3 %; isotropic ones as without moments."""
+    """Moments by 72 directions against 26 for a source that fills a cube: equal to 3 %; isotropic ones as without moments."""
     shape = (9, 9, 9)
     rng = np.random.default_rng(0)
     sigma = jnp.asarray(0.3 + 0.2 * rng.random(shape), jnp.float32)
