@@ -12,12 +12,13 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxvol import lights, media, phase, segments
 from jaxvol.direct import cells as ray_cells
 from jaxvol.direct import emitters, patterns, sky_field
-from jaxvol.direct.connections import Connections, Context, LightRun, bucket, resolve
+from jaxvol.direct.connections import Connections, Context, LightRun, batch_size, batches, resolve
 from jaxvol.sampling import dot
 from jaxvol.types import Rays
 
@@ -39,26 +40,28 @@ def scattered_light(
         t0, t1 = pieces.t[:, 0], pieces.t[:, -1]
     chosen = np.flatnonzero(np.asarray(t0) < np.asarray(t1))
     result = np.zeros((n, 3), np.float32)
-    if chosen.size == 0:
-        return jnp.asarray(result)
-    lanes = np.concatenate([chosen, np.full(min(bucket(chosen.size), max(n, chosen.size)) - chosen.size, chosen[0])])
-    origin, direction, t0, t1, pixel, sample = (
-        np.asarray(x)[lanes] for x in (rays.origin, rays.direction, t0, t1, pixel, sample)
-    )
-    borders, region = None, None
-    if pieces is not None:
-        borders, region = _borders(np.asarray(pieces.t)[lanes], np.asarray(pieces.region)[lanes], plan.num_cells)
-    cells = _cut(context.marching, origin, direction, t0, t1, borders, region, num_cells=plan.num_cells)
+    data = [np.asarray(x) for x in (rays.origin, rays.direction, t0, t1, pixel, sample)]
+    found = None if pieces is None else (np.asarray(pieces.t), np.asarray(pieces.region))
+    for part, lanes in batches(chosen, batch_size(n, least=2048)):
+        origin, direction, begin, end, *shifts = (x[lanes] for x in data)
+        borders, region = (None, None) if found is None else _borders(found[0][lanes], found[1][lanes], plan.num_cells)
+        cells = _cut(context.marching, origin, direction, begin, end, borders, region, num_cells=plan.num_cells)
+        light = _from_lights(context, cells, origin, direction, *shifts, seed, num_samples)
+        result[part] = np.asarray(light)[: part.size]
+    return jnp.asarray(result)
+
+
+def _from_lights(context, cells, origin, direction, pixel, sample, seed, num_samples):
+    """What the cells of some rays scatter to the eye, of all lights."""
     total = jnp.zeros(origin.shape, jnp.float32)
     for run in context.lights:
         if run.field is not None:
-            sizes = {"num_steps": plan.num_field_steps, "num_samples": num_samples}
+            sizes = {"num_steps": context.plan.num_field_steps, "num_samples": num_samples}
             total = total + _from_field(context.marching, run.field, cells, origin, direction, sample, **sizes)
             continue
         for connections in _connections(context, run, cells, origin, direction, pixel, sample, seed, num_samples):
             total = total + resolve(context, run, connections)
-    result[chosen] = np.asarray(total)[: chosen.size]
-    return jnp.asarray(result)
+    return total
 
 
 @jax.jit
@@ -197,7 +200,7 @@ def _to_emitters(
     middle = 0.5 * (cells.t[1:] + cells.t[:-1])
     known = sum(emitters.brightness(light, origin + middle[..., None] * direction))
     # A cell behind the faces may reach in front of them: no cell is ruled out.
-    known = known + 1e-3 * jnp.max(known, axis=0) + 1e-30
+    known = known + 1e-3 * lax.stop_gradient(jnp.max(known, axis=0)) + 1e-30
     nodes, u1, u2 = _sky_nodes(marching, cells, pixel, sample, seed, num_steps, num_samples, _EMITTER_SET, known)
     points = origin + nodes.t[..., None] * direction
     found = emitters.sample(light, points, u1, u2)
