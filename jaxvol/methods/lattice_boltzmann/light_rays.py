@@ -8,6 +8,7 @@ lit surfaces. All on the host, once per picture.
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -188,20 +189,12 @@ def reflected(scene: Scene, low: np.ndarray, high: np.ndarray, *, count: int, se
 
     The way from the light to the surface is attenuated by the medium. Light reflected more than once is missed.
     """
-    u = kronecker(count, 8, seed + 1)
-    columns = [jnp.asarray(u[:, k], jnp.float32) for k in range(5)]
-    sent = emission.sample_emission(scene, *columns)
+    columns = np.asarray(kronecker(count, 8, seed + 1).T, np.float32)
     caster, scale = ray_casting.caster_for(scene.mesh), ray_casting.scene_scale(scene.mesh)
-    start = jnp.where(
-        sent.on_surface[:, None],
-        ray_casting.offset_origin(sent.position, sent.normal, sent.direction, scale=scale),
-        sent.position,
-    )
-    start, way = np.array(start, np.float32), np.array(sent.direction, np.float32)
+    start, way, power = (np.asarray(x) for x in _sent(scene, scale, *columns[:5]))
     infinite = np.full(count, np.inf, np.float32)
     t, face = ray_casting.intersect(caster, start, way, infinite)
-    hits = ray_casting.hits(scene.mesh, start, way, t, face)
-    power = np.asarray(sent.power, float) / count
+    power = power.astype(float) / count
     if scene.medium is not None:
         thickness = extinction.optical_thickness(
             scene.medium,
@@ -212,12 +205,27 @@ def reflected(scene: Scene, low: np.ndarray, high: np.ndarray, *, count: int, se
             num_steps=64,
         )
         power = power * np.exp(-np.asarray(thickness, float))
-    surface = materials.surface_at(scene.mesh, jnp.maximum(hits.face, 0))
-    power = power * np.asarray(surface.albedo, float) * np.asarray(hits.valid)[:, None]
-    normal = materials.facing_normal(hits.normal, jnp.asarray(way))
-    u6, u7 = (jnp.asarray(u[:, k], jnp.float32) for k in (5, 6))
-    out = sampling.sample_cosine_hemisphere(u6, u7, normal)
-    origin = np.array(ray_casting.offset_origin(hits.position, normal, out, scale=scale), np.float64)
-    direction = np.asarray(out, float)
+    found = _reflected(scene.mesh, scale, start, way, t, face, *columns[5:7])
+    origin, direction, share = (np.asarray(x, float) for x in found)
+    power = power * share
     kept = (power.max(1) > 0) & _meets_box(origin, direction, low, high)
     return _with_shadows(scene, origin[kept], direction[kept], power[kept])
+
+
+@jax.jit
+def _sent(scene, scale, *u):
+    """(origin, direction, power) of rays from the lights."""
+    sent = emission.sample_emission(scene, *u)
+    beside = ray_casting.offset_origin(sent.position, sent.normal, sent.direction, scale=scale)
+    return jnp.where(sent.on_surface[:, None], beside, sent.position), sent.direction, sent.power
+
+
+@jax.jit
+def _reflected(mesh, scale, start, way, t, face, *u):
+    """(origin, direction, share of the power) of what rays that hit the mesh send on; 0 for those that miss."""
+    hits = ray_casting.hits(mesh, start, way, t, face)
+    surface = materials.surface_at(mesh, jnp.maximum(hits.face, 0))
+    normal = materials.facing_normal(hits.normal, way)
+    out = sampling.sample_cosine_hemisphere(*u, normal)
+    origin = ray_casting.offset_origin(hits.position, normal, out, scale=scale)
+    return origin, out, jnp.where(hits.valid[:, None], surface.albedo, 0.0)

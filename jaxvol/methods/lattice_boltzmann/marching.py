@@ -222,10 +222,10 @@ def _rounds(advance, rays, track, books, max_rounds=800):
 
 
 def _bucket(count):
-    """Few array sizes, so that rounds share compilations."""
+    """Few array sizes, so that rounds share compilations; a few small ones cost more to compile than their padding to march."""
     size = 1024
     while size < count:
-        size *= 2
+        size *= 4 if size < 16384 else 2
     return size
 
 
