@@ -82,28 +82,31 @@ class BiconjugateGradients(_Solver):
         precondition = (lambda r: r) if preconditioner is None else preconditioner.mv
         limit = self.tolerance * self.tolerance * _dot(vector, vector)
 
+        # a step is two halves, each one A: both in one body, so that programs hold A and its preconditioner once
         def unfinished(carry):
-            _, r, _, _, rho, _, omega, step = carry
-            return (_dot(r, r) > limit) & (step < self.max_steps) & (rho != 0) & (omega != 0)
+            _, r, _, _, rho, _, omega, half, _ = carry
+            return (half % 2 == 1) | ((_dot(r, r) > limit) & (half < 2 * self.max_steps) & (rho != 0) & (omega != 0))
 
         def advance(carry):
-            y, r, p, v, rho_before, alpha, omega, step = carry
-            rho = _dot(vector, r)
-            p = r + (rho / rho_before) * (alpha / omega) * (p - omega * v)
-            x = precondition(p)
-            v = operator.mv(x)
-            alpha = rho / _dot(vector, v)
-            s = r - alpha * v
-            z = precondition(s)
-            t = operator.mv(z)
-            size = _dot(t, t)
-            omega = jnp.where(size > 0, _dot(t, s) / jnp.where(size > 0, size, 1.0), 0.0)
-            return y + alpha * x + omega * z, s - omega * t, p, v, rho, alpha, omega, step + 1
+            y, r, p, v, rho_before, alpha, omega, half, x = carry
+            first = half % 2 == 0
+            rho = jnp.where(first, _dot(vector, r), rho_before)
+            p = jnp.where(first, r + (rho / rho_before) * (alpha / omega) * (p - omega * v), p)
+            z = precondition(jnp.where(first, p, r))
+            image = operator.mv(z)
+            # first half: v = A x, r becomes s; second half: t = A z, r becomes the next residual
+            alpha = jnp.where(first, rho / _dot(vector, image), alpha)
+            size = _dot(image, image)
+            least = jnp.where(size > 0, _dot(image, r) / jnp.where(size > 0, size, 1.0), 0.0)
+            omega = jnp.where(first, omega, least)
+            y = jnp.where(first, y, y + alpha * x + omega * z)
+            r = r - jnp.where(first, alpha, omega) * image
+            return y, r, p, jnp.where(first, image, v), rho, alpha, omega, half + 1, jnp.where(first, z, x)
 
         nothing, one = jnp.zeros_like(vector), jnp.ones((), vector.dtype)
-        carry = (nothing, vector, nothing, nothing, one, one, one, 0)
-        y, r, _, _, _, _, _, num_steps = lax.while_loop(unfinished, advance, carry)
-        return _answer(y, r, vector, num_steps, self.tolerance)
+        carry = (nothing, vector, nothing, nothing, one, one, one, 0, nothing)
+        y, r, _, _, _, _, _, num_halves, _ = lax.while_loop(unfinished, advance, carry)
+        return _answer(y, r, vector, num_halves // 2, self.tolerance)
 
 
 def _answer(y, r, vector, num_steps, tolerance):
