@@ -1,5 +1,6 @@
 """From lights to fluence per voxel: voxelise, march, solve the lattice, keep the layers apart."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -86,14 +87,14 @@ def illuminate(scene: Scene, plan: Plan, *, seed: int = 0, on_stage=None) -> Ill
     if plan.solve and directional:
         flow = sum(b.flow for b in books)
         results = [_directional(materials, c, whole, flow, plan) for c in range(plan.num_channels)]
-        scattered, flux, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
+        scattered, flux, applications, residual, converged = _stacked(results)
         from_volume = jnp.zeros_like(scattered)  # orders are not split
     elif plan.solve:
         sigmas = [(materials.scattering[c], materials.absorption[c]) for c in range(plan.num_channels)]
         if plan.homogeneous:
             sigmas = [(s[0, 0, 0], a[0, 0, 0]) for s, a in sigmas]
         results = [_channel(*sigmas[c], deposit[c], first[c], wall, reflectances[c], plan) for c in range(plan.num_channels)]
-        from_volume, scattered, applications, residual, converged = (jnp.stack(x) for x in zip(*results, strict=True))
+        from_volume, scattered, applications, residual, converged = _stacked(results)
         if materials.solid is not None:  # what walls gather is no fluence; near them the medium's is held
             from_volume, scattered = (jax.vmap(_fill, (0, None))(x, materials.solid) for x in (from_volume, scattered))
     else:
@@ -140,6 +141,12 @@ def _walls(materials, plan):
 
 
 @jax.jit
+def _stacked(results):
+    """The channels' results, each a tuple, as a tuple of stacks."""
+    return tuple(jnp.stack(x) for x in zip(*results, strict=True))
+
+
+@jax.jit
 def _fill(field, solid):
     """The mean over the neighbours that are not solid, in solid voxels; 0 where there are none."""
     weight = jnp.where(solid, 0.0, 1.0)
@@ -152,11 +159,10 @@ def _fill(field, solid):
 def _directional(materials, channel, whole, flow, plan):
     """(fluence, flux times 3 lambda_1, applications, residual, converged) with a Theta that depends on direction."""
     scattering, absorption, g = materials.scattering[channel], materials.absorption[channel], materials.asymmetry
-    sources = first_sources(scattering, whole, flow, g, channel, plan=plan)
+    sources, strength = first_sources(scattering, whole, flow, g, channel, plan=plan)
     if not plan.corrections:
         found = solve_directional(scattering, absorption, g, sources, plan.tolerance, plan=plan)
     else:
-        strength = _strength(scattering, g, plan.degree)
 
         def arrive(moments):
             emitted = strength * moments + sources
@@ -170,15 +176,14 @@ def _directional(materials, channel, whole, flow, plan):
             arrive(jnp.zeros_like(sources)), arrive, answer, scattering, plan
         )
         found = anisotropy.Moments(moments, applications, residual, converged)
-    scale = anisotropy.eigenvalues(g, plan.degree)[1]
-    flux = 3.0**0.5 * scale * found.moments[1:4]  # the moments carry sqrt(3)
-    return jnp.maximum(found.moments[0], 0.0), flux, found.num_applications, found.residual, found.converged
+    fluence, flux = _fluence_and_flux(found.moments, g, degree=plan.degree)
+    return fluence, flux, found.num_applications, found.residual, found.converged
 
 
-def _strength(scattering, g, degree):
-    """k lambda_l of each moment."""
-    scale = anisotropy.eigenvalues(g, degree)
-    return jnp.stack([scattering * scale[l] for l in anisotropy.orders(degree)])
+@partial(jax.jit, static_argnames="degree")
+def _fluence_and_flux(moments, g, *, degree):
+    """(fluence, flux times 3 lambda_1) of moments, which carry sqrt(3)."""
+    return jnp.maximum(moments[0], 0.0), 3.0**0.5 * anisotropy.eigenvalues(g, degree)[1] * moments[1:4]
 
 
 def _corrected(defect, arrive, answer, scattering, plan):
@@ -191,35 +196,54 @@ def _corrected(defect, arrive, answer, scattering, plan):
     light, applications, share = jnp.zeros_like(defect), jnp.zeros((), jnp.int32), 1.0
     for turn in range(1 + plan.corrections):
         if turn:
-            before, defect = defect, arrive(light) - light
-            image = before - defect  # what one `step` takes off
-            share = _ratio(jnp.sum(scattering * before * image), jnp.sum(scattering * image * image))
-            light, defect = light + (share - 1.0) * step, before - share * image
-        relative, tolerance = _wanted(defect, light, turn, plan)
+            light, defect, share = _measured(light, defect, arrive(light), step, scattering)
+        last = turn == plan.corrections
+        relative, tolerance = _wanted(defect, light, plan.tolerance, last=last)
         found, solution = answer(defect, tolerance)
-        step = defect + found
-        light = light + (share if turn == plan.corrections else 1.0) * step
+        light, step = _corrected_once(light, defect, found, share if last else np.float32(1.0))
         applications = applications + solution.num_applications
     return light, applications, relative * solution.residual, solution.converged
+
+
+@jax.jit
+def _measured(light, before, arriving, step, scattering):
+    """(light, defect, share): with the share of the last `step` that leaves the smallest defect of what is scattered."""
+    image = before - (arriving - light)  # what one `step` takes off
+    share = _ratio(jnp.sum(scattering * before * image), jnp.sum(scattering * image * image))
+    share = lax.stop_gradient(share)  # how fast defects fall is no part of the answer
+    return light + (share - 1.0) * step, before - share * image, share
 
 
 def _ratio(a, b):
     return jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 1.0)
 
 
-def _wanted(defect, light, turn, plan):
+@partial(jax.jit, static_argnames="last")
+def _wanted(defect, light, tolerance, *, last):
     """(share of the defect in the light that arrives, relative residual that its solve should reach)."""
+    defect, light = lax.stop_gradient((defect, light))
     arriving = light + defect
     # an error of the correction weighs as much less as the defect is smaller than the light itself
     share = jnp.sqrt(jnp.sum(defect * defect) / jnp.maximum(jnp.sum(arriving * arriving), 1e-30))
-    tolerance = jnp.minimum(plan.tolerance / jnp.maximum(share, 1e-6), 0.1)
+    tolerance = jnp.minimum(tolerance / jnp.maximum(share, 1e-6), 0.1)
     # before the last one: what is left is part of the next defect
-    return share, jnp.maximum(tolerance, _EARLY) if turn < plan.corrections else tolerance
+    return share, tolerance if last else jnp.maximum(tolerance, _EARLY)
+
+
+@jax.jit
+def _corrected_once(light, defect, found, share):
+    """(light, step) with the defect and what the lattice `found` for it, that often."""
+    step = defect + found
+    return light + share * step, step
 
 
 def _first_sources(scattering, whole, flow, g, channel, *, plan):
+    """(moments of what the marched light scatters first, k lambda_l of each moment)."""
     mean = jnp.maximum(jnp.mean(whole, axis=0), 1e-20)
-    return anisotropy.first_collisions(scattering, whole[channel], flow * (whole[channel] / mean), g, plan.degree)
+    scale = anisotropy.eigenvalues(g, plan.degree)
+    strength = jnp.stack([scattering * scale[l] for l in anisotropy.orders(plan.degree)])
+    sources = anisotropy.first_collisions(scattering, whole[channel], flow * (whole[channel] / mean), g, plan.degree)
+    return sources, strength
 
 
 def _solve_directional(scattering, absorption, g, sources, tolerance, *, plan):
@@ -280,10 +304,18 @@ def march(
     books = [x[:num] for x in (found.sent, found.live, found.escaped)]
     if not plan.first_order:
         return _Light(found.track, *books, found.num_steps, None, None)
-    direction = found.flow / jnp.maximum(jnp.mean(found.track, axis=0), 1e-20)
-    part, whole = found.track[:num], found.track[num:]
-    whole = whole * _beside_denser(materials.scattering[num:] + materials.absorption[num:])
-    return _Light(part, *books, found.num_steps, direction * jnp.mean(part, axis=0), Unscattered(whole, direction))
+    part, flow, unscattered = _with_and_without(found.track, found.flow, materials.scattering, materials.absorption)
+    return _Light(part, *books, found.num_steps, flow, unscattered)
+
+
+@jax.jit
+def _with_and_without(track, flow, scattering, absorption):
+    """(track, its flow, light that was not scattered at all) of channels marched with the forward part and again without."""
+    num = track.shape[0] // 2
+    direction = flow / jnp.maximum(jnp.mean(track, axis=0), 1e-20)
+    part, whole = track[:num], track[num:]
+    whole = whole * _beside_denser(scattering[num:] + absorption[num:])
+    return part, direction * jnp.mean(part, axis=0), Unscattered(whole, direction)
 
 
 def _beside_denser(extinction):

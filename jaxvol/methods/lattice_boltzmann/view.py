@@ -55,8 +55,15 @@ class Source(NamedTuple):
 
 def emission_table(grid: Grid, *sources: Source, unit: float = 1.0) -> tuple[Float[Array, "voxels F"], Layout]:
     """Fluence [`unit` W/m2] of each layer and channel, moments and marched light if any, side by side for one gather."""
-    scale = 1.0 / (grid.voxel * grid.voxel * unit)
     flux, first = (any(getattr(s, name) is not None for s in sources) for name in ("flux", "track"))
+    some = next(x for s in sources for x in (s.fluence, s.track) if x is not None)
+    table = _table(grid, sources, unit, flux=flux, first=first)
+    return table, Layout(len(sources), some.shape[0], flux, first)
+
+
+@partial(jax.jit, static_argnames=("flux", "first"))
+def _table(grid, sources, unit, *, flux, first):
+    scale = 1.0 / (grid.voxel * grid.voxel * unit)
     some = next(x for s in sources for x in (s.fluence, s.track) if x is not None)
     dark = jnp.zeros_like(some)
     columns = [f for s in sources for f in (dark if s.fluence is None else s.fluence)]
@@ -70,7 +77,7 @@ def emission_table(grid: Grid, *sources: Source, unit: float = 1.0) -> tuple[Flo
         for s in sources:
             flow = jnp.zeros((3, *some.shape[1:])) if s.track is None else s.direction * jnp.mean(s.track, axis=0)
             columns += list(flow)
-    return corner_table(*[scale * c for c in columns]), Layout(len(sources), some.shape[0], flux, first)
+    return corner_table(*[scale * c for c in columns])
 
 
 def _sources(row, layout, towards):
