@@ -12,6 +12,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
@@ -56,14 +57,17 @@ def first_radius(
 
 def shell(first: Float[Array, "S"], *, level: int, num_levels: int, tail: bool) -> tuple[Float[Array, "S"], Float[Array, "S"]]:
     """Squared inner and outer radius of the shell of `level`; with `tail` the last one is unbounded. Empty if first is 0."""
-    lit = first > 0
-    outer = first * 2.0**level
-    inner = jnp.zeros_like(first) if level == 0 else 0.5 * outer
-    outer = jnp.where(lit, jnp.inf, 0.0) if tail and level == num_levels - 1 else outer
+    largest = 2.0**level
+    return _shell(first, np.float32(0.5 * largest if level else 0.0), np.float32(largest), tail and level == num_levels - 1)
+
+
+@jax.jit
+def _shell(first, inner, outer, endless):
+    outer = jnp.where(endless & (first > 0), jnp.inf, first * outer)
+    inner = first * inner
     return inner * inner, outer * outer
 
 
-@partial(jax.jit, static_argnames=("level", "num_levels", "tail", "group_size", "cluster_size"))
 def level_surfels(
     lit: LitSurfels,
     first: Float[Array, "S"],
@@ -81,12 +85,19 @@ def level_surfels(
     delta stays that of the original surfel: scaled with the area it would bias pairs nearer than it.
     """
     inner, outer = shell(first, level=level, num_levels=num_levels, tail=tail)
-    emitted = lit.radiance * (lit.area * 4.0**level)[:, None]
+    sizes = {"group_size": group_size, "cluster_size": cluster_size}
+    return _ordered_rows(lit, inner, outer, np.float32(4.0**level), origin, order.reshape(-1), **sizes)
+
+
+@partial(jax.jit, static_argnames=("group_size", "cluster_size"))
+def _ordered_rows(lit, inner, outer, scale, origin, order, *, group_size, cluster_size):
+    """Rows in a level's order; levels whose groups have one size share the program."""
+    emitted = lit.radiance * (lit.area * scale)[:, None]
     delta = jnp.maximum(lit.area * (0.5 / jnp.pi), 1e-10 * jnp.max(lit.area))
     columns = [*(lit.position - origin).T, *lit.normal.T, inner, outer, delta, *emitted.T]
     if lit.lobe_direction is not None:
         columns += [*lit.lobe_direction.T, lit.lobe_exponent]
-    row = jnp.stack(columns, axis=-1)[order.reshape(-1)]
+    row = jnp.stack(columns, axis=-1)[order]
     groups = order.reshape(-1, group_size)
     return LevelSurfels(row=row.reshape(-1, group_size, row.shape[-1]), cluster=groups[:, 0] // cluster_size)
 
