@@ -349,9 +349,9 @@ def _rows(vertices, chosen):
     return jax.tree.map(lambda x: np.asarray(x)[chosen], vertices)
 
 
-def padded(values, *, factor=2):
-    """`values` with zeros up to a power of `factor` times 64: few sizes, few compilations."""
-    size = 64
+def padded(values, *, factor=2, least=64):
+    """`values` with zeros up to a power of `factor` times `least`: few sizes, few compilations."""
+    size = least
     while size < len(values):
         size *= factor
     return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype)])
@@ -360,10 +360,10 @@ def padded(values, *, factor=2):
 def _compact(state, alive):
     """The live lanes, padded with dead ones; `alive` (numpy) may be less than the state's own.
 
-    Every size is a program that takes longer to compile than a whole walk to run: sizes fall to a quarter at a time.
+    Every size is a program that takes longer to compile than a whole walk to run: sizes fall to a sixteenth at a time.
     """
     lanes = np.flatnonzero(alive)
-    chosen = padded(lanes, factor=4)
+    chosen = padded(lanes, factor=16, least=256)
     live = np.arange(len(chosen)) < len(lanes)
     if len(chosen) >= len(alive):
         chosen, live = np.arange(len(alive)), alive

@@ -163,8 +163,9 @@ def select(
     clamp = _clamp(scene, plan)
     measure = partial(importance, scene, camera, rows, clamp=clamp, isotropic=plan.isotropic)
     weights, powers = {}, {}
+    longest = 1 << (max(block.position.shape[0] for _, block in parts) - 1).bit_length()
     for name, block in parts:
-        weights[name] = np.asarray(measure(block), np.float64)
+        weights[name] = np.asarray(measure(_longer(block, longest)), np.float64)[: block.position.shape[0]]
         powers[name] = _power(block)
     total, power = (sum(x.sum() for x in values.values()) for values in (weights, powers))
     rng = np.random.default_rng([seed & 0xFFFFFFFF, _SELECTION])
@@ -206,6 +207,15 @@ def _clamp(scene, plan):
     if plan.mean_free_paths is None:
         return 1e-6 * compensation.most_clamp(scene, plan.most_clamp)
     return compensation.clamp_at(scene, None, jnp.zeros((1, 3), jnp.float32), plan=plan)[0]
+
+
+def _longer(block, size):
+    """Dark lights up to a common number: kinds that are alike share a program."""
+
+    def extended(x):
+        return np.concatenate([np.asarray(x), np.zeros((size - x.shape[0], *x.shape[1:]), np.float32)])
+
+    return jax.tree.map(extended, block)
 
 
 def _power(block):
