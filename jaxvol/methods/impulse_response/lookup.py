@@ -72,25 +72,29 @@ def prepare(
         if multiple and table.multiple is None:
             raise ValueError(f"the table file has no multiple scattering of {kind!r}; set scattering = 'single'")
     mode = "similarity" if similarity else "table"
-    return _prepare(tables, medium, g_range, grey=grey, multiple=multiple, mode=mode, num_tau=num_tau, num_angle=num_angle)
+    albedo, moments, g, constants = _constants(medium)
+    numbers = {"moments": moments, "g": g, "g_range": g_range}
+    shapes = {"mode": mode, "multiple": multiple, "num_tau": num_tau}
+    grids = {}
+    for kind in ("point", "directional", "area"):
+        shapes["num_angle"] = num_angle if kind == "area" else 1
+        # Channel by channel: grey media and others share the program.
+        grids[kind] = tuple(_grid(tables, kind, albedo=albedo[i], **numbers, **shapes) for i in range(1 if grey else 3))
+    return Responses(**grids, **constants)
 
 
-@partial(jax.jit, static_argnames=("grey", "multiple", "mode", "num_tau", "num_angle"))
-def _prepare(tables, medium, g_range, *, grey, multiple, mode, num_tau, num_angle):
+@jax.jit
+def _constants(medium):
+    """Albedo of each channel, moments and mean cosine of the phase function, and what needs no table."""
     albedo = media.single_scattering_albedo(medium)
     moments = None if medium.phase is None else medium.phase.moments
     g = medium.g if medium.phase is None else medium.phase.moments[1]
-    options = {"moments": moments, "g": g, "g_range": g_range, "mode": mode}
-    channels = 1 if grey else 3
-    grids = {}
-    for kind in ("point", "directional", "area"):
-        angles = num_angle if kind == "area" else 1
-        make = partial(_grid, tables, kind, **options, multiple=multiple, num_tau=num_tau, num_angle=angles)
-        grids[kind] = tuple(make(albedo=albedo[i]) for i in range(channels))
     returned = 0.5 * albedo * phase.evaluate(medium, jnp.float32(-1.0))
-    return Responses(**grids, albedo=albedo, transport=1 - albedo * g, returned=returned)
+    constants = {"albedo": albedo, "transport": 1 - albedo * g, "returned": returned}
+    return tuple(albedo), moments, g, constants
 
 
+@partial(jax.jit, static_argnames=("kind", "mode", "multiple", "num_tau", "num_angle"))
 def _grid(tables, kind, *, moments, g, albedo, g_range, mode, multiple, num_tau, num_angle):
     response = zonal_lookup.medium_response(tables, kind, moments=moments, g=g, albedo=albedo, g_range=g_range, multiple=mode)
     dtype = response.single.dtype
