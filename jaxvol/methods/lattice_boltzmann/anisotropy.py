@@ -13,6 +13,7 @@ voxel; for several its moments are taken as those of Henyey and Greenstein about
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -91,8 +92,12 @@ def transport(
     *,
     degree: int,
     kind: ProbabilityMap = "pade",
+    own: bool = True,
 ) -> Float[Array, "n X Y Z"]:
-    """B: moments of the light that sources with these moments [W per voxel] make without any further scattering."""
+    """B: moments of the light that sources with these moments [W per voxel] make without any further scattering.
+
+    Without `own` the fluence that a voxel's source makes in itself is left out.
+    """
     total = jnp.zeros_like(sources)
     for axis in range(3):
         along = (axis, *(a for a in range(3) if a != axis))
@@ -101,7 +106,7 @@ def transport(
             continue
         signs = mirror_signs((axis,), degree)
         planes = both_senses(extinction[None], along)[:, :, 0], both_senses(sources, along, signs)
-        total = total + one_grid(_scan(lattice, *planes, steps, along, degree, kind), along, signs)
+        total = total + one_grid(_scan(lattice, *planes, steps, along, degree, kind, own), along, signs)
     return total
 
 
@@ -112,7 +117,7 @@ def mirror_signs(axes: tuple[int, ...], degree: int) -> np.ndarray:
     return np.sign(np.array(basis(*mirrored, degree)) / np.array(basis(*place, degree)))
 
 
-def _scan(lattice, extinction, sources, steps, along, degree, kind):
+def _scan(lattice, extinction, sources, steps, along, degree, kind, own):
     """Moments [planes, 2, n, rows, columns] of the light of sources of that shape."""
     classes = sorted({link_class(c) for c in steps})
     headings = []
@@ -130,8 +135,11 @@ def _scan(lattice, extinction, sources, steps, along, degree, kind):
         for f, (cls, row, column, values) in zip(arrivals, headings, strict=True):
             beta, gamma, passing = link[cls]
             emitted = lattice.weight(cls) * sum(v * source[:, n] for n, v in enumerate(values) if abs(v) > 1e-6)
-            mean = link_length(cls) * (beta * f + gamma * emitted)
-            gathered = [t + v * mean if abs(v) > 1e-6 else t for t, v in zip(gathered, values, strict=True)]
+            arriving = link_length(cls) * beta * f
+            mean = arriving + link_length(cls) * gamma * emitted
+            # values[0] = 1: what other moments of the source add to a voxel's own fluence its links cancel
+            counted = [mean if n or own else arriving for n in range(len(values))]
+            gathered = [t + v * m if abs(v) > 1e-6 else t for t, v, m in zip(gathered, values, counted, strict=True)]
             leaving.append(move_plane(passing * f + beta * emitted, row, column))
         return tuple(leaving), jnp.stack(gathered, axis=1)
 
@@ -184,29 +192,47 @@ def solve(
     extinction = scattering + absorption
     scale = eigenvalues(g, degree)
     strength = jnp.stack([scattering * scale[l] for l in orders(degree)])
-    apply = lambda s: transport(lattice, extinction, s, degree=degree, kind=kind)  # noqa: E731
-    right = apply(sources)
+    run = partial(transport, lattice, extinction, degree=degree, kind=kind)
+    right = run(sources)
     size = _norm(right)
     unit = right / jnp.where(size > 0, size, 1.0)
     # diffusion follows the transport cross-section, and only the fluence is diffusive
     reduced = extinction - scattering * scale[1] if degree else extinction
-    levels = lax.stop_gradient(preconditioner.build(extinction.shape, reduced, absorption))
+    levels = lax.stop_gradient(preconditioner.build(extinction.shape, reduced, absorption, kind=kind))
     frozen, tolerance = lax.stop_gradient((scattering, tolerance))
+    leaves = _leaving(lattice, scattering, absorption, kind)
+
+    def operator(m):
+        """m - B (strength m), without the difference of 1 and of what stays in a thick white voxel: float32 has none left."""
+        through = run(strength * m, own=False)
+        return jnp.concatenate([(leaves * m[0] - through[0])[None], (m - through)[1:]])
 
     def precondition(r):
         return r.at[0].add(preconditioner.v_cycle(levels, frozen * r[0]))
 
     structure = jax.eval_shape(lambda: unit)
     answer = lx.linear_solve(
-        lx.FunctionLinearOperator(lambda m: m - apply(strength * m), structure),
+        lx.FunctionLinearOperator(operator, structure),
         unit,
         BiconjugateGradients(tolerance=tolerance, max_steps=max_steps),
         options={"preconditioner": lx.FunctionLinearOperator(precondition, structure)},
         throw=False,
     )
-    image = apply(strength * answer.value)
-    residual = lax.stop_gradient(_norm(unit + image - answer.value))
-    return Moments(right + size * image, 2 * answer.stats["num_steps"] + 2, residual, residual <= 3.0 * tolerance)
+    rest = unit - operator(answer.value)
+    residual = lax.stop_gradient(_norm(rest))
+    # one more sweep: right + size B (strength value)
+    return Moments(size * (answer.value + rest), 2 * answer.stats["num_steps"] + 2, residual, residual <= 3.0 * tolerance)
+
+
+def _leaving(lattice, scattering, absorption, kind):
+    """1 less what of a voxel's source it scatters again before it leaves (sigma_s h Gamma), by x gamma = 1 - beta."""
+    extinction = scattering + absorption
+    out = 0.0
+    for cls, weight in lattice.class_weights:
+        count = sum(link_class(c) == cls for c in lattice.directions)
+        out = out + count * weight * beta_gamma(extinction * link_length(cls), kind)[0]
+    thick = extinction > 0
+    return jnp.where(thick, (absorption + scattering * out) / jnp.where(thick, extinction, 1.0), 1.0)
 
 
 def _norm(x):

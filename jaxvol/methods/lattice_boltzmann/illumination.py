@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from jaxvol import slopes
 from jaxvol.methods.lattice_boltzmann import anisotropy, fine_sweeps, fresnel, light_rays, marching, occupancy, preconditioner
 from jaxvol.methods.lattice_boltzmann import materials as material_pass
 from jaxvol.methods.lattice_boltzmann.lattice import coefficients, lattice, mean_through, shift
@@ -312,7 +313,7 @@ def march(
 def _with_and_without(track, flow, scattering, absorption):
     """(track, its flow, light that was not scattered at all) of channels marched with the forward part and again without."""
     num = track.shape[0] // 2
-    direction = flow / jnp.maximum(jnp.mean(track, axis=0), 1e-20)
+    direction = slopes.ratio(flow, jnp.mean(track, axis=0))
     part, whole = track[:num], track[num:]
     whole = whole * _beside_denser(scattering[num:] + absorption[num:])
     return part, direction * jnp.mean(part, axis=0), Unscattered(whole, direction)
@@ -366,7 +367,11 @@ def _channel(scattering, absorption, deposit, first, wall, reflectance, plan):
 def _solve_channel(scattering, absorption, deposit, wall, reflectance, tolerance, *, plan):
     directions = lattice(plan.lattice)
     co = coefficients(directions, scattering, absorption, kind=plan.probability_map, wall=wall, wall_reflectance=reflectance)
-    levels = preconditioner.build(deposit.shape, scattering + absorption, absorption) if plan.preconditioned else None
+    levels = (
+        preconditioner.build(deposit.shape, scattering + absorption, absorption, kind=plan.probability_map)
+        if plan.preconditioned
+        else None
+    )
     return solve(directions, co, deposit, tolerance=tolerance, max_steps=plan.max_applications, levels=levels)
 
 

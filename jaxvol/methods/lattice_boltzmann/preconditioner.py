@@ -18,6 +18,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxvol.methods.lattice_boltzmann.lattice import ProbabilityMap
+
 # Links longer than this many voxels without a collision are no diffusion; it also bounds 1/(3 sigma_t h) in voids.
 _MIN_THICKNESS = 0.05
 _SMOOTHING = 6.0 / 7.0  # damping of Jacobi, the optimum for the constant-coefficient stencil in 3D
@@ -32,9 +34,19 @@ class Level(NamedTuple):
     diagonal: Float[Array, "X Y Z"]
 
 
-def build(shape: tuple[int, int, int], extinction: Float[Array, "..."], absorption: Float[Array, "..."]) -> tuple[Level, ...]:
-    """The grids of the V-cycle, finest first, from sigma_t h and sigma_a h (scalars or [X, Y, Z])."""
+def build(
+    shape: tuple[int, int, int],
+    extinction: Float[Array, "..."],
+    absorption: Float[Array, "..."],
+    *,
+    kind: ProbabilityMap = "pade",
+) -> tuple[Level, ...]:
+    """The grids of the V-cycle, finest first, from sigma_t h and sigma_a h (scalars or [X, Y, Z]).
+
+    With the exponential map light diffuses through thick voxels as if they were 2 tanh(sigma_t h / 2) thick.
+    """
     extinction = jnp.broadcast_to(jnp.asarray(extinction, jnp.float32), shape)
+    extinction = 2.0 * jnp.tanh(0.5 * extinction) if kind == "exp" else extinction
     sink = jnp.broadcast_to(jnp.asarray(absorption, jnp.float32), shape)
     diffusion = 1.0 / (3.0 * jnp.maximum(extinction, _MIN_THICKNESS))
     faces = []

@@ -1,6 +1,7 @@
 """Scattering that depends on direction: the Theta of moments, its solve, and the exact first order in the picture."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -184,3 +185,13 @@ def test_track_beside_denser_voxels():
         found = illumination._beside_denser(density * share)
         np.testing.assert_allclose(found[0, 0], expected, rtol=2e-3)
         np.testing.assert_allclose(found[0, 1:], 1.0, rtol=1e-6)
+
+
+def test_a_white_voxel_as_thick_as_float32_has_digits_lets_all_light_out():
+    """One voxel of 1e7 mean free paths against the closed form; 1 less what stays in it has no digits in float32."""
+    thickness = 1e7
+    full = lambda x: jnp.full((1, 1, 1), x, jnp.float32)  # noqa: E731
+    solve = jax.jit(partial(anisotropy.solve, LATTICE, degree=0, kind="exp"))
+    found = solve(full(thickness), full(0.0), full(0.0), full(1.0)[None])
+    assert bool(found.converged)
+    assert float(found.moments[0, 0, 0, 0]) == pytest.approx(1.0 / np.sum(LATTICE.weights / LATTICE.lengths), rel=1e-3)
