@@ -222,10 +222,10 @@ def num_lights(scene: Scene) -> int:
 def _point_like(position, origin, intensity, shading):
     """A sample towards `origin` of an isotropic emitter; shading(travel direction) scales the intensity."""
     delta = origin - position
-    squared = jnp.maximum(dot(delta, delta), 1e-28)
-    distance = jnp.sqrt(squared)
-    direction = delta / distance[..., None]
-    radiance = intensity * (shading(-direction) / squared)[..., None]
+    distance = jnp.sqrt(jnp.maximum(dot(delta, delta), 1e-28))
+    inverse = 1.0 / distance  # the slope of 1 / distance^2 in one step would leave float32
+    direction = delta * inverse[..., None]
+    radiance = intensity * (shading(-direction) * inverse * inverse)[..., None]
     return direction, distance, radiance, jnp.ones_like(distance), jnp.ones(distance.shape, bool), origin
 
 

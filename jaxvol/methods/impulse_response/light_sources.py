@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxvol import lights, sampling
+from jaxvol import lights, sampling, slopes
 from jaxvol.methods.impulse_response import surface_paths
 from jaxvol.sampling import dot
 from jaxvol.types import Scene
@@ -59,7 +59,7 @@ def choose(scene, position, kind, u, *, falloff: int) -> tuple[Int[Array, "n"], 
 
 
 def _shares(weight):
-    return weight / jnp.maximum(jnp.sum(weight, axis=-1, keepdims=True), 1e-30) + 1e-6
+    return slopes.ratio(weight, jnp.maximum(jnp.sum(weight, axis=-1, keepdims=True), 1e-30)) + 1e-6
 
 
 @partial(jax.jit, static_argnames=("kind", "scatters"))

@@ -14,6 +14,7 @@ fits the 1/r^2 of both, or for spots in their cone; along a cosine-distributed d
 which stays inside the medium; and by free flight along it.
 """
 
+from dataclasses import replace
 from functools import partial
 from math import pi
 from typing import NamedTuple
@@ -112,6 +113,7 @@ def _placed(marching, position, onward, light, u, num_steps, shares):
     by_aim, by_angle = shares
     aimed, evenly = u[3] < by_aim, (u[3] >= by_aim) & (u[3] < by_aim + by_angle)
     bounds = marching.regions[0].bounds
+    light = _apart(light, bounds)
     emitter = position + light.distance[:, None] * light.direction
     aside, reach, drawn = (_by_half_angles if light.cone is None else _in_cone)(bounds, position, emitter, light, u)
     direction = jnp.where(aimed[:, None], aside, onward)
@@ -127,6 +129,17 @@ def _placed(marching, position, onward, light, u, num_steps, shares):
     even = sampling.sample_equiangular_pdf(t, position, direction, t0, t1, emitter)
     along = by_angle * jnp.where(t1 > t0, even, 0.0) + (1 - by_aim - by_angle) * density * rho
     return direction, t, column, rho, by_aim * aimed_pdf, along
+
+
+def _apart(light, bounds):
+    """The light, but a box's size away from receivers at its very place, whose direction to it is 0 / 0 and has no slope.
+
+    It only tells where places are drawn, and their densities are of the light as it is here.
+    """
+    on_it = light.distance < 2 * NEAREST
+    size = lax.stop_gradient(jnp.max(bounds[1] - bounds[0]))
+    direction = jnp.where(on_it[:, None], jnp.array([0.0, 0.0, 1.0], jnp.float32), light.direction)
+    return replace(light, direction=direction, distance=jnp.where(on_it, size, light.distance))
 
 
 def _by_half_angles(bounds, position, emitter, light, u):

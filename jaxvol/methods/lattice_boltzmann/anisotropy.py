@@ -105,8 +105,8 @@ def transport(
         if not steps:
             continue
         signs = mirror_signs((axis,), degree)
-        planes = both_senses(extinction[None], along)[:, :, 0], both_senses(sources, along, signs)
-        total = total + one_grid(_scan(lattice, *planes, steps, along, degree, kind, own), along, signs)
+        planes = both_senses(extinction[None], along)[:, :, 0], both_senses(sources, along, signs=signs)
+        total = total + one_grid(_scan(lattice, *planes, steps, along, degree, kind, own), along, signs=signs)
     return total
 
 

@@ -86,8 +86,8 @@ def moments(
         # turned upside down the grid is swept backwards
         signs = mirror_signs(along[:2], degree)
         both = extinction if jnp.ndim(extinction) == 0 else both_senses(extinction[None], along, mirrored=2)[:, :, 0]
-        found = _scan(both, both_senses(sources, along, signs, mirrored=2), _steps(axis, along, degree), kind)
-        total = total + one_grid(found, along, signs, mirrored=2)
+        found = _scan(both, both_senses(sources, along, signs=signs, mirrored=2), _steps(axis, along, degree), kind)
+        total = total + one_grid(found, along, signs=signs, mirrored=2)
     return total
 
 

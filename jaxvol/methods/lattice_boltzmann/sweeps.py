@@ -95,7 +95,7 @@ def move_plane(plane: Float[Array, "*b rows columns"], row_step: int, column_ste
 
 
 def both_senses(
-    fields: Float[Array, "n X Y Z"], along: tuple[int, int, int], signs: np.ndarray | float = 1.0, *, mirrored: int = 1
+    fields: Float[Array, "n X Y Z"], along: tuple[int, int, int], *, signs: np.ndarray | float = 1.0, mirrored: int = 1
 ) -> Float[Array, "planes 2 n rows columns"]:
     """Planes across the axis `along[0]` of a grid and of itself mirrored along the first `mirrored` axes of `along`.
 
@@ -108,8 +108,8 @@ def both_senses(
 def one_grid(
     planes: Float[Array, "planes 2 n rows columns"],
     along: tuple[int, int, int],
-    signs: np.ndarray | float = 1.0,
     *,
+    signs: np.ndarray | float = 1.0,
     mirrored: int = 1,
 ) -> Float[Array, "n X Y Z"]:
     """The sum of both, back in the grid that `both_senses` took."""
