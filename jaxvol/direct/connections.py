@@ -3,7 +3,6 @@
 A scene's lights are visited one by one: a `LightRun` is a scene with a single light and how often it is sampled.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -186,14 +185,14 @@ def resolve(context: Context, run: LightRun, connections: Connections) -> Float[
         return _attenuate_by_columns(value, lit, run.columns, context.marching.regions[0], rays[0])
     if segments.is_box(context.scene.medium) and context.scene.medium.density is None:
         return _attenuate_and_sum(value, lit, _depth(context, *rays))
-    # Marching is dear: only connections that still carry light and meet the medium.
+    # Marching is dear: only connections that still carry light and meet the medium, padded to few different sizes.
     lit = np.asarray(_carries_light(value)) if lit is None else lit
     chosen = np.flatnonzero(lit.reshape(-1) & np.asarray(_meets_medium(context.marching, *rays)))
     result = np.where(lit[..., None], np.asarray(value), np.float32(0.0)).reshape(-1, 3)
-    rays = [np.asarray(x) for x in rays]
-    for part, padded in batches(chosen, batch_size(lit.size, least=4096)):
-        depth = _depth(context, *(x[padded] for x in rays))
-        result[part] *= np.exp(-np.asarray(depth)[: part.size])
+    if chosen.size:
+        padded = np.concatenate([chosen, np.full(bucket(chosen.size) - chosen.size, chosen[0])])
+        depth = _depth(context, *(np.asarray(x)[padded] for x in rays))
+        result[chosen] *= np.exp(-np.asarray(depth)[: chosen.size])
     return jnp.asarray(result.reshape(value.shape).sum(axis=0))
 
 
@@ -219,14 +218,10 @@ def _depth(context, origin, direction, distance):
     )
 
 
-def batch_size(count: int, *, least: int) -> int:
-    """A power of two near an eighth of `count`, but not below `least`, unless all of it is less than that."""
-    eighth = 1 << max((count // 8).bit_length() - 1, 0)
-    return min(max(least, eighth), 1 << max(count - 1, 0).bit_length())
-
-
-def batches(chosen: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Indices in parts of `size`, each as it is and filled up with its first: one size has one compilation."""
-    for first in range(0, chosen.size, size):
-        part = chosen[first : first + size]
-        yield part, np.concatenate([part, np.full(size - part.size, part[0])])
+def bucket(count: int) -> int:
+    """The next of the sizes 256, 320, 384, 448, 512, 640, ...: at most a quarter more, few compilations."""
+    power = 256
+    while power * 2 <= count:
+        power *= 2
+    step = power // 4
+    return max(256, -(-count // step) * step)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from jaxvol import lights, media, phase, segments
 from jaxvol.direct import cells as ray_cells
 from jaxvol.direct import emitters, patterns, sky_field
-from jaxvol.direct.connections import Connections, Context, LightRun, batch_size, batches, resolve
+from jaxvol.direct.connections import Connections, Context, LightRun, bucket, resolve
 from jaxvol.sampling import dot
 from jaxvol.types import Rays
 
@@ -40,28 +40,26 @@ def scattered_light(
         t0, t1 = pieces.t[:, 0], pieces.t[:, -1]
     chosen = np.flatnonzero(np.asarray(t0) < np.asarray(t1))
     result = np.zeros((n, 3), np.float32)
-    data = [np.asarray(x) for x in (rays.origin, rays.direction, t0, t1, pixel, sample)]
-    found = None if pieces is None else (np.asarray(pieces.t), np.asarray(pieces.region))
-    for part, lanes in batches(chosen, batch_size(n, least=2048)):
-        origin, direction, begin, end, *shifts = (x[lanes] for x in data)
-        borders, region = (None, None) if found is None else _borders(found[0][lanes], found[1][lanes], plan.num_cells)
-        cells = _cut(context.marching, origin, direction, begin, end, borders, region, num_cells=plan.num_cells)
-        light = _from_lights(context, cells, origin, direction, *shifts, seed, num_samples)
-        result[part] = np.asarray(light)[: part.size]
-    return jnp.asarray(result)
-
-
-def _from_lights(context, cells, origin, direction, pixel, sample, seed, num_samples):
-    """What the cells of some rays scatter to the eye, of all lights."""
+    if chosen.size == 0:
+        return jnp.asarray(result)
+    lanes = np.concatenate([chosen, np.full(min(bucket(chosen.size), max(n, chosen.size)) - chosen.size, chosen[0])])
+    origin, direction, t0, t1, pixel, sample = (
+        np.asarray(x)[lanes] for x in (rays.origin, rays.direction, t0, t1, pixel, sample)
+    )
+    borders, region = None, None
+    if pieces is not None:
+        borders, region = _borders(np.asarray(pieces.t)[lanes], np.asarray(pieces.region)[lanes], plan.num_cells)
+    cells = _cut(context.marching, origin, direction, t0, t1, borders, region, num_cells=plan.num_cells)
     total = jnp.zeros(origin.shape, jnp.float32)
     for run in context.lights:
         if run.field is not None:
-            sizes = {"num_steps": context.plan.num_field_steps, "num_samples": num_samples}
+            sizes = {"num_steps": plan.num_field_steps, "num_samples": num_samples}
             total = total + _from_field(context.marching, run.field, cells, origin, direction, sample, **sizes)
             continue
         for connections in _connections(context, run, cells, origin, direction, pixel, sample, seed, num_samples):
             total = total + resolve(context, run, connections)
-    return total
+    result[chosen] = np.asarray(total)[: chosen.size]
+    return jnp.asarray(result)
 
 
 @jax.jit
