@@ -83,6 +83,6 @@ def pad_list(tile: np.ndarray, group: np.ndarray, *, batch: int) -> tuple[np.nda
     num = len(tile)
     capacity = batch
     while capacity < num:
-        capacity *= 8  # what is beyond `num` costs memory only
+        capacity *= 8 if capacity < 64 * batch else 2  # what is beyond `num` costs memory only, much of it in long lists
     fill = np.zeros(capacity - num, np.int32)
     return np.concatenate([tile, fill]), np.concatenate([group, fill]), num
